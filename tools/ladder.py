@@ -5,7 +5,7 @@
 
 Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, taking finished rows from results/ladder. A fine-tuning
 overwrites its policy at each evaluation; every version is copied to DIR/snapshots, since the cloning loss on held-out
-episodes is measured for each rung (`ladder_cloning.py`). Re-run the same command to resume.
+episodes is measured for each rung (`ladder_policies.py`). Re-run the same command to resume.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import numpy as np
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.results import RUNS, read_results
-from vd4rl_pomdp.studies.navigation.claims import Numbers
 from vd4rl_pomdp.studies.navigation.measures import (
     OBJECTIVES,
     UNTRAINED,
@@ -21,6 +20,7 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_number,
     refitted_error,
 )
+from vd4rl_pomdp.studies.navigation.report import Numbers
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_runs, numbers_of
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
@@ -32,9 +32,9 @@ MEASURES = (*PAPERS_WAY, *REFITTED, *REFITTED_RAW)
 """Of a maze's table: the paper's way and units, then both units by the refitted probe."""
 REFERENCES = {
     UNTRAINED: "untrained",
-    "supervised+a": "told the states: memory and actions",
-    "supervised": "told the states: memory",
-    "supervised_picture": "told the states: one picture",
+    "supervised+a": "`supervised+a`",
+    "supervised": "`supervised`",
+    "supervised_picture": "`supervised_picture`",
 }
 """Methods that no objective trains, as the pages call them."""
 HARD_SPREADS = {
@@ -119,11 +119,10 @@ def state_lines(numbers: Numbers, ks: Sequence[int]) -> Iterator[str]:
 
 
 def texture_lines(numbers: Numbers) -> Iterator[str]:
-    """State errors at K = 15 with textures in the pictures, and without them."""
+    """State errors at K = 15 with textures in the pictures."""
     yield from _head(["seeds", *(f"`{name}`" for name in _ORDER)])
     for maze in _measured(numbers):
-        if with_them := list(_state_lines(numbers, "textures", Condition(maze, "", exogenous=True))):
-            yield from (*with_them, *_state_lines(numbers, "without", Condition(maze, "")))
+        yield from _state_lines(numbers, "textures", Condition(maze, "", exogenous=True))
 
 
 def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The tables of results/offline/README.md and results/control/README.md, made from the rows of both folders."""
+"""The tables of results/offline, results/control and results/methods/README.md, made from the rows of these folders."""
 
 from __future__ import annotations
 
@@ -55,15 +55,22 @@ CONTRASTS = {
     "both: `mik+a` less `acro`": ("mik+a", "acro"),
 }
 """The paper's claims, as differences of returns."""
+CORRUPTIONS = {"patch+zero_frames": "patches and frames", "none": "nothing"}
+"""What is hidden, as the table of methods calls it, in the order of its columns."""
 ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
 """Policies that were played with nothing hidden after their runs had ended."""
 
 
 def main_runs() -> list[Run]:
-    """Finished TD3+BC of the two grids, without variants."""
-    cells = [cell for name in GRIDS for cell in load_grid(name).cells()]
-    found = load_runs([RESULTS / name for name in GRIDS], choice=GridMembers(" and ".join(GRIDS), cells))
-    return [run for run in found if run.rows and run.finished and not run.variant]
+    """Finished TD3+BC of the grids offline and control, without variants."""
+    return [run for run in runs_of(GRIDS, GRIDS) if not run.variant]
+
+
+def runs_of(grids: Sequence[str], folders: Sequence[str]) -> list[Run]:
+    """Finished fine-tunings of grids, in folders of results: other grids have some of their cells."""
+    cells = [cell for name in grids for cell in load_grid(name).cells()]
+    found = load_runs([RESULTS / name for name in folders], choice=GridMembers(" and ".join(grids), cells))
+    return [run for run in found if run.rows and run.finished]
 
 
 def return_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -237,3 +244,29 @@ def _told(runs: list[Run]) -> str:
     returns = episodes_of(runs)
     text = with_interval(returns.mean(), *(mean_interval(returns) or (None, None)), 0)
     return text + (f" (n = {len(runs)})" if len(runs) < 3 else "")
+
+
+def method_lines(runs: Sequence[Run]) -> Iterator[str]:
+    """A row for every method, those that return most where patches and frames are hidden first."""
+    told = "hidden: return (episodes) | probe: pose, velocity"
+    yield f"| | {' | '.join(f'{words} {told}' for words in CORRUPTIONS.values())} |"
+    yield "|---|---:|---:|---:|---:|"
+    cells = {(run.method, run.labels["corruption"]): run for run in runs}
+    ranks = {method: _rank_of(cells, method) for method, _ in cells}
+    for method in sorted(ranks, key=ranks.__getitem__, reverse=True):
+        yield f"| `{method}` | {' | '.join(_told_once(cells.get((method, hidden))) for hidden in CORRUPTIONS)} |"
+
+
+def _rank_of(cells: dict[tuple[str, str], Run], method: str) -> tuple[float, ...]:
+    """Returns by corruption; what was not trained under it comes last."""
+    mine = (cells.get((method, hidden)) for hidden in CORRUPTIONS)
+    return tuple(returns_of([run]).item() if run else -1.0 for run in mine)
+
+
+def _told_once(run: Run | None) -> str:
+    """Return, lowest and highest episode, and probe errors; dashes if there is no run."""
+    if run is None:
+        return f"{number(None)} | {number(None)}"
+    probes = ", ".join(number(run.measures[name], 1) for name in PROBES)
+    episodes = [row["return"] for row in run.last]
+    return f"{returns_of([run]).item():.0f} ({min(episodes):.0f} to {max(episodes):.0f}) | {probes}"

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ladder_table
-import methods_table
 import navigation_table
 import offline_table
 from script import run_script
@@ -34,6 +33,7 @@ class Config:
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, which is told by its path in the repository."""
+    methods = offline_table.runs_of(["methods"], ["methods", "offline", "control"])
     returns, mazes, rungs = offline_table.main_runs(), navigation_table.numbers_in(), ladder_table.cells_in()
     return {
         "results/control/README.md": {
@@ -45,7 +45,7 @@ def pages() -> dict[str, Tables]:
             "rungs": ladder_table.rung_lines(rungs),
             "budget": ladder_table.budget_lines(rungs),
         },
-        "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
+        "results/methods/README.md": {"methods": offline_table.method_lines(methods)},
         "results/navigation/README.md": {
             "mazes": navigation_table.state_lines(mazes, (15, 1)),
             "three_curtains": navigation_table.maze_lines(mazes, "three_curtains"),

@@ -1,41 +1,40 @@
-import resource
+from functools import partial
 
 import pytest
 import torch
 
 from pretrain.objectives import METHODS
-from tests.helpers_bench import NoProcess
-from vd4rl_pomdp.bench import measures, processes, suite
+from vd4rl_pomdp.bench import processes, suite
 from vd4rl_pomdp.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
 
 def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch):
-    dataset, opening = measures.synthetic_set(tmp_path, 8)
-    sections = {"opening": opening, "sampling": measures.sampling(dataset, 5)}
-    monkeypatch.setattr(measures, "BATCH", 4)
-    sections["finetuning"] = measures.finetuning(dataset, 1)
+    dataset, opening = suite.synthetic_set(tmp_path, 8)
+    sections = {"opening": opening, "sampling": suite.sampling(dataset, 5)}
+    monkeypatch.setattr(suite, "BATCH", 4)
+    sections["finetuning"] = suite.finetuning(dataset, 1)
     measured = flatten(sections)
-    assert opening["rows"] == dataset.num_rows == 8 * measures.EPISODE_ROWS
+    assert opening["rows"] == dataset.num_rows == 8 * suite.EPISODE_ROWS
     assert all(value > 0 for value in measured.values())
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
 
 
 def test_drawing_is_measured_over_more_frames_than_an_episode_has(monkeypatch):
-    made = measures.make_env
+    made = suite.make_env
 
     def short(task, render):
         env = made(task, render)
         monkeypatch.setattr(env, "_length", 2)
         return env
 
-    monkeypatch.setattr(measures, "make_env", short)
-    assert measures._render_wall(("fast", 5)) > 0
+    monkeypatch.setattr(suite, "make_env", short)
+    assert suite._render_wall(("fast", 5)) > 0
 
 
 def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
-    dataset, _ = measures.synthetic_set(tmp_path, 2)
-    measured = measures.methods(dataset, tmp_path, 1)
+    dataset, _ = suite.synthetic_set(tmp_path, 2)
+    measured = suite.methods(dataset, tmp_path, 1)
     ratios = {"k_30_over_k_15", "half_over_whole_resolution"}
     assert measured.keys() - ratios == {name for name, method in METHODS.items() if method.trained} - {
         *("supervised", "supervised+a", "supervised_picture", "integrator"),
@@ -44,23 +43,27 @@ def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
 
 
 def test_every_memory_is_measured_against_the_gru(tmp_path):
-    dataset, _ = measures.synthetic_set(tmp_path, 2)
-    measured = measures.memories(dataset, tmp_path, 1)
+    dataset, _ = suite.synthetic_set(tmp_path, 2)
+    measured = suite.memories(dataset, tmp_path, 1)
     assert {f"memories.{name}" for name in measured} == {name for name in GOALS if name.startswith("memories.")}
     assert all(value > 0 for value in measured.values())
 
 
 def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
-    measured = {"sharing": processes.sharing(0.05, rounds=1)}
-    assert all(value > 0 for value in flatten(measured).values())
-    assert {name for name in GOALS if name.startswith("sharing.")} <= set(flatten(measured))
+    measured = flatten({"sharing": processes.sharing(0.05, rounds=1)})
+    assert all(value > 0 for value in measured.values())
+    assert {name for name in GOALS if name.startswith("sharing.")} <= set(measured)
     speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "ACTIVE"): [125.0]}
-    monkeypatch.setattr(processes, "_speeds", lambda seconds, count, OMP_WAIT_POLICY="": speeds[count, OMP_WAIT_POLICY])
+
+    def apart(function, seconds, count=1, OMP_WAIT_POLICY=""):
+        return [{"updates_per_s": speed} for speed in speeds[count, OMP_WAIT_POLICY]]
+
+    monkeypatch.setattr(processes, "apart", apart)
     assert processes.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "passive_over_active": 0.8}
 
 
 def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
-    seen = {}
+    seen, small = {}, partial(suite.synthetic_set, episodes=1)
 
     def section(name):
         return lambda dataset, *_: seen.setdefault(name, {"device": dataset.t.device.type})
@@ -72,50 +75,41 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
         monkeypatch.setattr(suite, name, section(name))
     for name in ("memory", "collection", "sharing", "maze_pictures", "maze_training"):
         monkeypatch.setattr(suite, name, lambda *_: {})
-    monkeypatch.setattr(suite, "synthetic_set", lambda folder, episodes: measures.synthetic_set(folder, 1))
+    monkeypatch.setattr(suite, "synthetic_set", lambda folder, _: small(folder))
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
     results = suite.bench()
     assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 4]
 
 
 def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):
-    monkeypatch.setattr(measures, "BATCH", 4)
-    dataset, _ = measures.synthetic_set(tmp_path, 1)
-    stacked = measures.stacking(dataset, 1)
+    monkeypatch.setattr(suite, "BATCH", 4)
+    dataset, _ = suite.synthetic_set(tmp_path, 1)
+    stacked = suite.stacking(dataset, 1)
     assert all(value > 0 for value in stacked.values())
 
-    class Jax(NoProcess):
-        def answer(self):
-            return {"ms": 1.0}
-
-    monkeypatch.setattr(measures, "Worker", Jax)
-    monkeypatch.setattr(measures.importlib.util, "find_spec", lambda _: True)
-    told = measures.against_jax(dataset, 1, (16,))
+    monkeypatch.setattr(suite, "apart", lambda *_: [{"ms": 1.0, "device": "cpu"}])
+    monkeypatch.setattr(suite.importlib.util, "find_spec", lambda _: True)
+    told = suite.against_jax(dataset, 1, (16,))
     for ours in ("units_16_fp32", "units_16_bf16"):
         assert told[f"{ours}_jax_over_ours"] == pytest.approx(1 / told[f"{ours}_ms"])
-    monkeypatch.setattr(measures.importlib.util, "find_spec", lambda _: None)
-    assert "pip install" in measures.against_jax(dataset, 1)["jax"]
+    monkeypatch.setattr(suite.importlib.util, "find_spec", lambda _: None)
+    assert "pip install" in suite.against_jax(dataset, 1)["jax"]
 
 
 @pytest.mark.gpu
 def test_a_set_on_a_gpu_can_be_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr(measures, "BATCH", 4)
-    dataset = measures.synthetic_set(tmp_path, 8)[0].to("cuda")
-    assert measures.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
-    assert all(value > 0 for value in measures.finetuning(dataset, 1).values())
+    monkeypatch.setattr(suite, "BATCH", 4)
+    dataset = suite.synthetic_set(tmp_path, 8)[0].to("cuda")
+    assert suite.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
+    assert all(value > 0 for value in suite.finetuning(dataset, 1).values())
 
 
-def test_memory_is_told_where_linux_does_not_tell_it(tmp_path, monkeypatch):
-    kibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    monkeypatch.setattr(processes.sys, "platform", "linux")
-    peak, private = processes.resident(tmp_path / "none")
-    assert (peak // 1024, private) == (pytest.approx(kibibytes, rel=0.01), None)
-    monkeypatch.setattr(processes.sys, "platform", "darwin")
-    assert processes.resident(tmp_path / "none")[0] == pytest.approx(kibibytes, rel=0.01)
-    monkeypatch.setattr(processes, "run_jobs", lambda *_: [(300, None)])
-    assert processes.memory(tmp_path, 200) == {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5}
-    (tmp_path / "status").write_text("Name:\ta:b\nVmHWM:\t  2048 kB\nRssAnon:\t  1024 kB\n")
-    assert processes.resident(tmp_path / "status") == (2 << 20, 1 << 20)
+def test_memory_is_that_of_the_process_over_its_frames(tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "run_jobs", lambda *_: [[300, 100]])
+    told = {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5, "second_process_over_frames": 0.5}
+    assert processes.memory(tmp_path, 200) == told
+    monkeypatch.setattr(processes, "_STATUS", tmp_path / "none")
+    assert processes.memory(tmp_path, 200) == {}
 
 
 def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch):
@@ -124,5 +118,5 @@ def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch)
             function()
         return [1.0, 0.1, 0.05]
 
-    monkeypatch.setattr(measures, "alternating", in_turns)
-    assert measures.maze_training() == {"training_steps_per_s": 1.0, "training_overhead_share": pytest.approx(0.15)}
+    monkeypatch.setattr(suite, "alternating", in_turns)
+    assert suite.maze_training() == {"training_steps_per_s": 1.0, "training_overhead_share": pytest.approx(0.15)}

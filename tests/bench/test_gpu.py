@@ -1,28 +1,24 @@
+import importlib
 import json
 
 import pytest
 
-from tests.helpers_bench import NoProcess
 from vd4rl_pomdp.bench import gpu, processes
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError, WorkerDiedError
 from vd4rl_pomdp.runs.files import flatten
 
 
-class Here(NoProcess):
-    """Measures in this process."""
-
-    def __init__(self, function, *arguments, **environment):
-        self.measure, self.ready = processes.named(function)(*arguments), False
-
-    def answer(self, within=0.0):
-        told, self.ready = self.measure() if self.ready else {}, True
-        return json.loads(json.dumps(told))
-
-
 @pytest.fixture
 def here(monkeypatch):
-    monkeypatch.setattr(gpu, "Worker", Here)
+    """Measures in this process what others would."""
+
+    def apart(function, *arguments, count=1, **environment):
+        module, _, name = function.rpartition(".")
+        measures = [getattr(importlib.import_module(module), name)(*arguments) for _ in range(count)]
+        return [json.loads(json.dumps(measure())) for measure in measures]
+
+    monkeypatch.setattr(gpu, "apart", apart)
     monkeypatch.setattr(gpu, "_BETWEEN_WAITS", 1)
 
 
@@ -57,11 +53,9 @@ def test_without_a_gpu_only_a_trial_is_run():
         gpu.gpu_bench("cpu")
 
 
-def test_a_process_that_ends_or_takes_too_long_is_told():
-    with processes.Worker("nothing") as worker, pytest.raises(WorkerDiedError, match="without an answer"):
-        worker.answer()
-    with processes.Worker("training", 60) as worker, pytest.raises(WorkerDiedError, match="over 0 s"):
-        worker.answer(0.01)
+def test_a_process_that_ends_without_an_answer_is_told():
+    with pytest.raises(WorkerDiedError, match="without an answer"):
+        processes.apart("vd4rl_pomdp.bench.processes.nothing")
 
 
 @pytest.mark.gpu

@@ -63,7 +63,7 @@ def test_a_curve_has_the_rows_that_training_logged(scripts, tmp_path):
 
 
 def test_cloning_losses_are_to_the_actions_of_the_data_as_an_agent_would_see_them(scripts, ran, encoder, monkeypatch):
-    script, asked = scripts("ladder_cloning"), []
+    script, asked = scripts("ladder_policies"), []
 
     def collect(config):
         asked.append(config)
@@ -76,7 +76,7 @@ def test_cloning_losses_are_to_the_actions_of_the_data_as_an_agent_would_see_the
     record["encoder"]["gru_layers"] = 1  # as the first runs have it
     write_json(run / "encoder" / "config.json", record)
     monkeypatch.setattr(script, "collect", collect)
-    config = script.Config(ran, ran / "cloning.csv")
+    config = script.Config("cloning", ran, ran / "cloning.csv")
     script.main(config)
     first = config.out.read_text()
     rows = list(csv.DictReader(first.splitlines()))

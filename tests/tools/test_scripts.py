@@ -1,82 +1,14 @@
-import csv
 import importlib
 import os
 import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
-from finetune.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.tasks import TASKS
-from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.envs.corrupted import CorruptedEnv
-from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.policies.actor import load_actor
 
 SCRIPTS = Path(__file__).parents[2] / "tools"
-
-
-def test_the_actor_acts_first_and_the_policy_remembers_its_actions(monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("hand_over")
-    torch.manual_seed(0)
-    encoder = Encoder(EncoderConfig(6, frame_encoder="nature", history="gru", use_actions=True, hidden_dim=8)).eval()
-    agent, expert = Agent(encoder, Policy(8, 6, 8).eval()), load_actor("walker_walk", "expert")
-    executed, remembered = [], []
-    env = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of("none"), length=60)
-    step, act = env.step, agent.act
-    env.step = lambda action: (executed.append(action), step(action))[1]
-    agent.act = lambda obs: (remembered.append(agent._action[0].numpy().copy()), act(obs))[1]
-    result = script.play(agent, expert, env, TASKS["walker_walk"], after=59, episode=0)
-    assert len(executed) == 60
-    np.testing.assert_array_equal(remembered[1:], executed[:-1])
-
-    watched = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of("none"), length=60)
-    now = watched.reset(20_000, 20_000, 0)
-    for action in executed[:59]:
-        np.testing.assert_array_equal(action, expert.act(now.time_step.state))
-        now = watched.step(action)
-    shown = expert.act(now.time_step.state)
-    assert not np.allclose(executed[59], shown)
-    assert result["error_after"] == round(float(np.square(executed[59] - shown).mean()), 4)
-    assert result["reward"] == round(float(watched.step(executed[59]).time_step.reward), 4)
-
-    with pytest.raises(UserError, match="--after is 60, and an episode has 60 decisions"):
-        script.play(agent, expert, env, TASKS["walker_walk"], after=60, episode=0)
-
-
-def test_who_hands_over_is_the_actor_of_the_data(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script, medium = importlib.import_module("hand_over"), load_actor("cheetah_run", "medium")
-    Reference(294.0, {"task": "cheetah_run", "quality": "medium", "sha256": medium.sha256}).write(tmp_path)
-    assert script.actor_of(tmp_path).sha256 == medium.sha256
-    Reference(294.0).write(tmp_path)
-    with pytest.raises(UserError, match="the one actor of its data is not known"):
-        script.actor_of(tmp_path)
-
-
-def test_actors_on_noisy_states_play_their_own_episodes_and_lose_return(tmp_path, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("noisy_states")
-    noises = {"pose_noises": (0, 34), "velocity_noises": (0, 49)}
-    script.main(script.Config(("cheetah_run",), **noises, episodes=2, out=tmp_path / "table.csv"))
-    with (tmp_path / "table.csv").open() as file:
-        rows = [(row["actor"], row["pose_noise"], float(row["return"])) for row in csv.DictReader(file)]
-    for actor, mine in (("expert", rows[:4]), ("medium", rows[4:])):
-        exact = importlib.import_module("export_actor").episode_returns(
-            load_actor("cheetah_run", actor), TASKS["cheetah_run"], 2, EVALUATION_SEED
-        )
-        assert mine[:2] == [(actor, "0", round(value, 4)) for value in exact]
-        assert all(row[:2] == (actor, "34") and row[2] < 0.8 * exact[0] for row in mine[2:])
-    assert all(value < 0.2 * rows[0][2] for *_, value in rows[2:4]), "the expert's gait asks for more than the medium's"
-    alone, noisy = (line.split(": ")[1].split() for line in capsys.readouterr().out.splitlines()[:2])
-    assert float(noisy[0]) > 2 * float(alone[0]), "falls, which only the noisy episodes have, vary the height"
 
 
 def test_another_python_makes_the_environment_anew(tmp_path):

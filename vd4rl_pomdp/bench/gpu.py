@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import gc
 import importlib.util
-import itertools
 import os
 import statistics
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -23,20 +22,16 @@ from typing import Any
 
 import torch
 
-from finetune.algorithms import ALGORITHMS
-from finetune.algorithms.algorithm import Algorithm
 from finetune.config import FinetuneConfig
-from finetune.end_to_end import EndToEnd
-from finetune.features import STAGE, FeatureSampler, FrozenEncoder, encode_views
+from finetune.evaluation import evaluate, jobs_of
+from finetune.features import STAGE, FrozenEncoder, encode_views
 from finetune.histories import Histories
-from finetune.train import Updates
-from finetune.trainer import FinetuneTrainer
 from pretrain.config import PretrainConfig
-from vd4rl_pomdp.bench.measures import synthetic_set
-from vd4rl_pomdp.bench.processes import JAX_MISSING, Worker, at_once, make_trainer
-from vd4rl_pomdp.core.errors import UserError, WorkerDiedError, first_line
+from vd4rl_pomdp.bench.processes import JAX_MISSING, apart, make_trainer
+from vd4rl_pomdp.bench.suite import next_update, on_features, synthetic_set
+from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.options import NO_OPTIONS, flat
-from vd4rl_pomdp.core.streams import random_stream
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
@@ -133,7 +128,7 @@ def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
         features = torch.randn(size.views, dataset.num_rows, encoder.dim, device=device).half()
         add("encoding", lambda: encoding(dataset, encoder, folder, size))
         for algorithm in ("td3_bc", "iql", "bc", "drqv2_bc"):
-            update = partial(on_features, dataset, features, algorithm, size, 1)
+            update = partial(on_features, finetuning(algorithm, size), dataset, features)
             add(algorithm, partial(measured, update, device, size.updates, size.blocks))
         add("td3_bc", lambda: peer(dataset, features, size, results["td3_bc"]["replayed_ms"]))
         add("stacked", lambda: stacked(dataset, features, size))
@@ -206,10 +201,10 @@ def peak(device: torch.device) -> dict[str, float]:
     return {"peak_gib": torch.cuda.max_memory_allocated(device) / 2**30} if device.type == "cuda" else {}
 
 
-def pretraining(folder: Path, method: str, size: Size, seed: int = 0) -> PretrainConfig:
+def pretraining(folder: Path, method: str, size: Size) -> PretrainConfig:
     """Settings of a pretraining: the `paper` preset in bf16."""
     return PretrainConfig.of(
-        "paper", data=folder, out=folder, method=method, corruption=CORRUPTION, precision="bf16", seed=seed,
+        "paper", data=folder, out=folder, method=method, corruption=CORRUPTION, precision="bf16",
         frame_encoder=size.frame_encoder, batch_size=size.windows, window=size.window,
         max_k=min(15, size.window - 1),
     )  # fmt: skip
@@ -234,35 +229,24 @@ def encoding(dataset: Dataset, encoder: Encoder, folder: Path, size: Size) -> di
 
 def stacked(dataset: Dataset, features: torch.Tensor, size: Size) -> dict[str, float]:
     """Milliseconds of an update of several stacked runs of TD3+BC, of all and of each."""
-    device, update = features.device, on_features(dataset, features, "td3_bc", size, size.runs)
-    ms = milliseconds(update, device, size.updates, size.blocks)
-    return {"runs": size.runs, "all_ms": ms, "a_seed_ms": ms / size.runs} | peak(device)
-
-
-def on_features(
-    dataset: Dataset, features: torch.Tensor, name: str, size: Size, seeds: int
-) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of an algorithm, or of so many stacked runs of it, sampling included, as in training."""
-    config, device = finetuning(name, size), features.device
-    histories, trainers = Histories(dataset, NO_OPTIONS, 3, 0), []
-    for seed in range(seeds):
-        batches = random_stream(seed, STAGE, "batches", device=device)
-        sampler = FeatureSampler(histories, features, config.batch_size, 3, 0.99, batches)
-        algorithm = algorithm_of(config, features.shape[-1], dataset, seed)
-        algorithm.policy.standardise.fit(features[:1])
-        trainers.append(trainer_of(algorithm, sampler, config))
-    return next_update(trainers)
+    update = on_features(finetuning("td3_bc", size), dataset, features, size.runs)
+    ms = milliseconds(update, features.device, size.updates, size.blocks)
+    return {"runs": size.runs, "all_ms": ms, "a_seed_ms": ms / size.runs} | peak(features.device)
 
 
 def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Tensor]]:
     """The next update of `drq_bc`, which trains its encoder, too."""
-    config, device = finetuning("drqv2_bc", size), dataset.t.device
-    encoder = Encoder(EncoderConfig(dataset.action_dim)).to(device)
-    algorithm = algorithm_of(config, encoder.dim, dataset, 0)
+    config = finetuning("drqv2_bc", size)
+    encoder = Encoder(EncoderConfig(dataset.action_dim)).to(dataset.t.device)
     view = View(dataset, CorruptionConfig.of(CORRUPTION), config.shift, 0, STAGE)
-    batches = random_stream(0, STAGE, "batches", device=device)
-    sampler = TransitionSampler(view, config.batch_size, batches, 3, 0.99)
-    return next_update([trainer_of(EndToEnd(algorithm, encoder, config), sampler, config)])
+    return next_update(
+        config,
+        dataset,
+        encoder.dim,
+        lambda draws: TransitionSampler(view, config.batch_size, draws, 3, 0.99),
+        1,
+        encoder,
+    )
 
 
 def finetuning(algorithm: str, size: Size) -> FinetuneConfig:
@@ -272,26 +256,6 @@ def finetuning(algorithm: str, size: Size) -> FinetuneConfig:
     )
 
 
-def algorithm_of(config: FinetuneConfig, dim: int, dataset: Dataset, seed: int) -> Algorithm:
-    """A config's algorithm on representations of a width, where the set is."""
-    device = dataset.t.device
-    policy = Policy(dim, dataset.action_dim, config.hidden_dim).to(device)
-    noise = random_stream(seed, STAGE, "noise", device=device)
-    return ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
-
-
-def trainer_of(algorithm: Algorithm | EndToEnd, sampler: Any, config: FinetuneConfig) -> FinetuneTrainer:
-    """A run that is never written."""
-    unwritten: Any = [None] * 4  # where its results would go, and what they would be compared with
-    return FinetuneTrainer(algorithm, sampler, config, *unwritten)
-
-
-def next_update(trainers: Sequence[FinetuneTrainer]) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of runs, of all at once."""
-    updates, made = Updates(trainers), itertools.count()
-    return lambda: updates(next(made))
-
-
 def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, float]:
     """Milliseconds that a step of one of several pretrainings at a time takes: that of all over their number.
 
@@ -299,7 +263,7 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
     """
     device = dataset.t.device
     streams = [torch.cuda.Stream(device) if device.type == "cuda" else None for _ in range(size.runs)]
-    updates = [make_trainer(dataset, pretraining(folder, "mik+a", size, seed)).update for seed in range(size.runs)]
+    updates = [make_trainer(dataset, pretraining(folder, "mik+a", size)).update for _ in range(size.runs)]
     wait(device)  # what they were made of is on another stream
 
     def step() -> None:
@@ -311,25 +275,17 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
     told = {"at_once": size.runs, "on_streams_ms": in_one} | peak(device)
     updates.clear()
     free(device)
-    seconds = 4.0 if size is PAPER else 0.1
-    with ExitStack() as stack:
-        workers = [
-            stack.enter_context(
-                Worker(f"{__name__}.pretraining_steps", str(folder), str(device), asdict(size), seed, seconds)
-            )
-            for seed in range(size.runs)
-        ]
-        speed = sum(answer["steps_per_s"] for answer in at_once(workers))
-    return told | {"in_processes_ms": 1e3 / speed, "each_ms": min(in_one, 1e3 / speed)}
+    given = str(folder), str(device), asdict(size), 4.0 if size is PAPER else 0.1
+    answers = apart(f"{__name__}.pretraining_steps", *given, count=size.runs)
+    in_processes = 1e3 / sum(answer["steps_per_s"] for answer in answers)
+    return told | {"in_processes_ms": in_processes, "each_ms": min(in_one, in_processes)}
 
 
-def pretraining_steps(
-    folder: str, device: str, size: dict[str, Any], seed: int, seconds: float
-) -> Callable[[], dict[str, Any]]:
+def pretraining_steps(folder: str, device: str, size: dict[str, Any], seconds: float) -> Callable[[], dict[str, Any]]:
     """Pretrain on the set in a folder, of `mik+a` in the `paper` preset and bf16, for so long."""
     place = torch.device(device)
     dataset = open_dataset(Path(folder) / "set", Path(folder) / "cache").to(place)
-    trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size), seed))
+    trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size)))
     milliseconds(trainer.update, place, 1, 1)  # settles it
 
     def measure() -> dict[str, float]:
@@ -356,35 +312,22 @@ def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: floa
         "views": len(features),
         "rows": dataset.num_rows,
     }
-    told: dict[str, Any] = {}
-    for tf32 in (False, True):
-        try:
-            # without the variable JAX takes three quarters of the card's memory as it starts
-            with Worker("jax_updates", shape, size.updates, tf32, XLA_PYTHON_CLIENT_PREALLOCATE="false") as worker:
-                worker.answer(60)
-                answers = []
-                for _ in range(size.blocks):
-                    worker.begin()
-                    answers.append(worker.answer(60))
-        except WorkerDiedError as error:
-            return told | {"jax": first_line(error)}
-        device, ms = answers[0]["device"], statistics.median(answer["ms"] for answer in answers)
-        if device == "cpu":  # a kind of processor, in JAX's words
-            return {"jax": f"sees no GPU: {ms:.3g} ms on the CPU"}
-        told |= {"jax_tf32_ms": ms} if tf32 else {"jax_ms": ms, "jax_over_replayed": ms / replayed_ms}
-    return told
+    given = "vd4rl_pomdp.bench.processes.jax_updates", shape, size.updates, size.blocks
+    # without the variable JAX takes three quarters of the card's memory as it starts
+    ((exact,), (tf32,)) = (apart(*given, words, XLA_PYTHON_CLIENT_PREALLOCATE="false") for words in (False, True))
+    if exact["device"] == "cpu":  # a kind of processor, in JAX's words
+        return {"jax": f"sees no GPU: {exact['ms']:.3g} ms on the CPU"}
+    return {"jax_ms": exact["ms"], "jax_over_replayed": exact["ms"] / replayed_ms, "jax_tf32_ms": tf32["ms"]}
 
 
-def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size, limit: float = 70.0) -> dict[str, Any]:
-    """Seconds of an evaluation on every core, unless nothing can be drawn here or it takes over `limit`."""
-    card = EncoderCard("mik+a", "walker_walk", "bench", flat(CorruptionConfig.of(CORRUPTION)), 0, 0, "paper")
-    save_encoder(folder / "encoder", encoder, card)
+def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size) -> dict[str, Any]:
+    """Seconds of an evaluation on every core."""
+    corruption = CorruptionConfig.of(CORRUPTION)
+    save_encoder(
+        folder / "encoder", encoder, EncoderCard("mik+a", "walker_walk", "bench", flat(corruption), 0, 0, "paper")
+    )
     Policy(encoder.dim, dataset.action_dim, size.hidden_dim).save(folder / "policy")
-    told = {"episodes": size.played, "cores": os.cpu_count()}
-    try:
-        with Worker("playing", str(folder), size.played, size.decisions) as worker:
-            worker.answer()
-            worker.begin()
-            return told | worker.answer(limit)
-    except WorkerDiedError as error:
-        return told | {"left_out": first_line(error)}
+    jobs = jobs_of(folder, TASKS.named("walker_walk"), [corruption], size.played, size.decisions)
+    start = time.perf_counter()
+    evaluate(jobs, 0)
+    return {"episodes": size.played, "cores": os.cpu_count(), "seconds": time.perf_counter() - start}

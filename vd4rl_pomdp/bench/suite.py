@@ -1,33 +1,59 @@
-"""Every measurement in turn, and what is promised of them."""
+"""`vd4rl-pomdp bench`: every measurement in turn, each against something else of the same run, and what is promised.
+
+A noisy machine bends ratios less than times.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import itertools
+import statistics
 import tempfile
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from vd4rl_pomdp.bench.measures import (
-    against_jax,
-    collection,
-    finetuning,
-    maze_pictures,
-    maze_training,
-    memories,
-    methods,
-    pretraining,
-    sampling,
-    stacking,
-    synthetic_set,
-)
-from vd4rl_pomdp.bench.processes import memory, sharing
-from vd4rl_pomdp.runs.device import pick_device
+from finetune.algorithms import ALGORITHMS
+from finetune.config import FinetuneConfig
+from finetune.end_to_end import EndToEnd
+from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder
+from finetune.histories import Histories
+from finetune.train import Updates
+from finetune.trainer import FinetuneTrainer
+from pretrain.config import PretrainConfig
+from pretrain.objectives import METHODS
+from vd4rl_pomdp.bench.processes import JAX_MISSING, apart, make_trainer, memory, sharing, touch
+from vd4rl_pomdp.core.options import NO_OPTIONS
+from vd4rl_pomdp.core.streams import RandomStream, random_stream
+from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, FRAME_STACK, TASKS
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, View, open_dataset
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.parity import canary_frames, compare
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.memory import MEMORIES
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.device import Precision, pick_device
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
+from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.studies.navigation.collect import PRESETS as SETS
+from vd4rl_pomdp.studies.navigation.collect import collect
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+from vd4rl_pomdp.studies.navigation.data import MazeData, open_maze_set
+from vd4rl_pomdp.studies.navigation.train import make_trainer as make_maze_trainer
 
 GOALS: dict[str, tuple[str, float]] = {
     "opening.open_seconds": ("<=", 1.0),
@@ -61,6 +87,13 @@ GOALS: dict[str, tuple[str, float]] = {
     "mazes.training_overhead_share": ("<=", 0.2),
 }
 """What this package promises on two cores without a GPU; of bf16 over fp32, where `machine.bf16_kernels` says yes."""
+
+
+BATCH = 256
+EPISODE_ROWS = EPISODE_TRANSITIONS + 1
+ROUNDS = 5
+"""Times that two ways of rendering take turns."""
+HISTORY_WINDOW = 32
 
 
 def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
@@ -110,3 +143,349 @@ def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]],
         verdict = {True: "[green]reached[/]", False: "[red]missed[/]", None: ""}[reached]
         table.add_row(name, shown, f"{relation} {goal:g}" if relation else "", verdict)
     Console().print(table)
+
+
+def seconds_of(function: Callable[[], Any], repeats: int) -> float:
+    """Median seconds of a call, after one that is not counted."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        function()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:])
+
+
+def alternating(rounds: int, *functions: Callable[[], Any]) -> list[float]:
+    """Median seconds of each function, called in turns: a machine that slows down slows all of them."""
+    times = [[seconds_of(function, 1) for function in functions] for _ in range(rounds)]
+    return [statistics.median(column) for column in zip(*times, strict=True)]
+
+
+def rate(function: Callable[[], Any], count: int) -> float:
+    """Calls per CPU-second, after some that are not counted."""
+    for _ in range(5):
+        function()
+    start = time.process_time()
+    for _ in range(count):
+        function()
+    return count / (time.process_time() - start)
+
+
+def synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]:
+    """Write, decode and open a set of `episodes` full episodes; random stripes compress fast and cost like pixels."""
+    rng = np.random.default_rng(0)
+    (folder / "set").mkdir()
+    for shard in range(0, episodes, 20):
+        count = min(20, episodes - shard)
+        rows = count * EPISODE_ROWS
+        step_type = np.full(rows, int(StepType.MID))
+        step_type[::EPISODE_ROWS], step_type[EPISODE_ROWS - 1 :: EPISODE_ROWS] = StepType.FIRST, StepType.LAST
+        stripes = rng.integers(0, 256, (rows, 3, FRAME_SIZE, 1), dtype=np.uint8)
+        arrays: dict[str, np.ndarray] = {
+            "observation": np.broadcast_to(stripes, (rows, 3, FRAME_SIZE, FRAME_SIZE)),
+            "action": rng.uniform(-1, 1, (rows, 6)).astype(np.float32),
+            "reward": rng.uniform(0, 2, rows),
+            "discount": np.ones(rows),
+            "step_type": step_type,
+        }
+        write_shard(folder / "set" / f"{shard // 20}_bench.hdf5", arrays, {})
+    start = time.perf_counter()
+    open_dataset(folder / "set", folder / "cache")
+    decoding = time.perf_counter() - start
+    opening = seconds_of(lambda: open_dataset(folder / "set", folder / "cache"), 3)
+    dataset = open_dataset(folder / "set", folder / "cache")
+    return dataset, {"rows": dataset.num_rows, "decode_seconds": decoding, "open_seconds": opening}
+
+
+def sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Gathering against copying the same bytes, and what shift and corruption add to it; new rows every time."""
+    some = min(dataset.num_transitions, 20_000)
+    touch(dataset.frames[:some])
+    generator = torch.Generator().manual_seed(0)
+
+    def rows() -> torch.Tensor:
+        return torch.randint(3, some - 1, (2 * BATCH,), generator=generator)
+
+    def copy() -> None:
+        start = int(rows()[0]) * (some - len(target)) // some
+        target.copy_(dataset.frames[start : start + len(target)])
+
+    def see(name: str) -> Callable[[], Any]:
+        view = View(dataset, CorruptionConfig.of(name), shift=4)
+        return lambda: view.observe(rows())
+
+    plain = View(dataset)
+    target = torch.empty(2 * BATCH * FRAME_STACK, *dataset.frames.shape[1:], dtype=torch.uint8)
+    copying, gathering, patch, both = alternating(
+        repeats, copy, lambda: plain.stacks(rows()), see("patch"), see("patch+zero_frames")
+    )
+    return {
+        "copy_ms": copying * 1e3,
+        "gather_ms": gathering * 1e3,
+        "gather_speed_over_copy": copying / gathering,
+        "corrupt_and_shift_over_gather": both / gathering - 1,
+        "patch_and_shift_over_gather": patch / gathering - 1,
+        "transitions_ms": seconds_of(lambda: plain.transitions(rows(), 3), repeats) * 1e3,
+    }
+
+
+def collection(frames: int) -> dict[str, float]:
+    """Frames per CPU-second of the fast rendering against dm_control's default, and two workers against one."""
+    rounds = [[rate(_acting(render), frames // ROUNDS) for render in ("exact", "fast")] for _ in range(ROUNDS)]
+    exact, fast = (statistics.median(column) for column in zip(*rounds, strict=True))
+    difference = compare(canary_frames("walker_walk", "fast"), canary_frames("walker_walk", "exact"))
+    alone = frames / next(iter(run_jobs(_render_wall, [("fast", frames)], 1)))
+    together = sum(frames / seconds for seconds in run_jobs(_render_wall, [("fast", 4 * frames)] * 2, 2)) * 4
+    return {
+        "exact_frames_per_cpu_s": exact,
+        "fast_frames_per_cpu_s": fast,
+        "fast_over_exact": fast / exact,
+        "fast_mean_difference_of_255": difference["mean_difference"],
+        "two_workers_over_one": together / alone,
+    }
+
+
+def _render_wall(job: tuple[Any, int]) -> float:
+    """Wall-clock seconds of one job, without the process's start."""
+    act = _acting(job[0])
+    start = time.perf_counter()
+    for _ in range(job[1]):
+        act()
+    return time.perf_counter() - start
+
+
+def _acting(render: Any) -> Callable[[], None]:
+    """One decision in an environment that has drawn its first frames, in a new episode when one is over."""
+    env = make_env(TASKS["walker_walk"], render)
+    action = np.zeros(env.action_dim, np.float32)
+    env.reset(0)
+
+    def act() -> None:
+        if env.step(action).last:
+            env.reset(0)
+
+    act()
+    return act
+
+
+def maze_pictures(frames: int) -> dict[str, float]:
+    """Pictures per CPU-second of the mazes, against PointMaze's own `render()` at the same size."""
+    from vd4rl_pomdp.envs.maze import MazeEnv, gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    default: Any = gymnasium.make(
+        "PointMaze_UMaze-v3", render_mode="rgb_array", width=PICTURE_SIZE, height=PICTURE_SIZE
+    )
+    default.reset(seed=0)
+    speeds = {"default_frames_per_cpu_s": rate(default.render, frames)}
+    for name, maze in (("fast", "no_curtain"), ("first_person", "first_person")):
+        env = MazeEnv(maze)
+        env.reset(seed=0, options={"state": np.array([1.0, 1.0] + [0.0] * (4 if maze == "first_person" else 2))})
+        speeds[f"{name}_frames_per_cpu_s"] = rate(env.draw, frames)
+    default.close()
+    for name in ("fast", "first_person"):
+        speeds[f"{name}_over_default"] = speeds[f"{name}_frames_per_cpu_s"] / speeds["default_frames_per_cpu_s"]
+    return speeds
+
+
+def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
+    """Share of a step that the batch (sampling, corruption, shift) and the optimiser take, and bf16 against fp32."""
+    results: dict[str, Any] = {"device": str(dataset.t.device)}
+    steps: dict[str, float] = {}
+    for precision in ("fp32", "bf16"):
+        given = {"data": folder, "out": folder, "batch_size": 8, "precision": precision}
+        config = PretrainConfig.of("paper", corruption="patch+zero_frames", **given)
+        trainer = make_trainer(dataset, config)
+        steps[precision], batch, optimiser = alternating(
+            max(3, repeats // 3), trainer.update, trainer.batches.sample, trainer.optimiser.step
+        )
+        results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
+        results[f"{precision}_overhead_share"] = (batch + optimiser) / steps[precision]
+    return results | {"bf16_over_fp32": steps["fp32"] / steps["bf16"]}
+
+
+def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
+    """Step time and frames/s of every method in the cpu preset, and what K and the resolution cost MIK+A.
+
+    Without those that regress states, which a set of random pictures has not.
+    """
+    trained = [name for name, method in METHODS.items() if method.trained and not method.regresses_state]
+    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
+    results: dict[str, Any] = {}
+    for name in trained:
+        trainer = make_trainer(dataset, config.altered(method=name))
+        seconds = seconds_of(trainer.update, max(3, repeats // 3))
+        frames = config.batch_size * config.window / seconds
+        results[name] = {"step_ms": seconds * 1e3, "frames_per_s": frames}
+    narrow, wide = (make_trainer(dataset, config.altered(max_k=k)).update for k in (15, 30))
+    once, twice = alternating(repeats, narrow, wide)
+    encoders = ("nature", "nature_half")
+    whole, half = alternating(
+        repeats, *(make_trainer(dataset, config.altered(frame_encoder=name)).update for name in encoders)
+    )
+    return results | {"k_30_over_k_15": twice / once, "half_over_whole_resolution": half / whole}
+
+
+def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
+    """A step of MIK+A in the cpu preset, and a row that its encoder streams, with every other memory over the GRU's."""
+    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
+    trainers = [make_trainer(dataset, config.altered(history=name)) for name in MEMORIES]
+    obs, action = View(dataset).stacks(torch.tensor([3], device=dataset.t.device)), dataset.action[3:4]
+
+    @torch.no_grad()
+    def stream(encoder: Encoder) -> None:
+        state = encoder.initial_state(1)
+        for _ in range(10):
+            _, state = encoder.step(obs, action, state)
+
+    rounds, gru = max(3, repeats // 3), list(MEMORIES).index("gru")
+    steps = alternating(rounds, *(trainer.update for trainer in trainers))
+    rows = alternating(repeats, *(partial(stream, trainer.objective.encoder) for trainer in trainers))
+    measured = {f"{name}_step_over_gru": seconds / steps[gru] for name, seconds in zip(MEMORIES, steps, strict=True)}
+    measured |= {f"{name}_row_over_gru": seconds / rows[gru] for name, seconds in zip(MEMORIES, rows, strict=True)}
+    return {name: ratio for name, ratio in measured.items() if not name.startswith("gru_")}
+
+
+def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Updates on cached features against updates that encode every batch, for both kinds of encoder; ReBRAC's cost.
+
+    The history is cut to a window: encoding whole episodes for every batch would take longer still.
+    """
+    memoryless = EncoderConfig(dataset.action_dim)
+    history = replace(memoryless, history="gru", use_actions=True, history_window=HISTORY_WINDOW)
+    results = {
+        "fp32": _updates_per_s(dataset, memoryless, "fp32", repeats // 3),
+        "bf16": _updates_per_s(dataset, memoryless, "bf16", repeats),
+        "history_bf16": _updates_per_s(dataset, history, "bf16", 1),
+    }
+    rates = {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+    features = random_features(dataset, 1)
+    td3_bc, rebrac = alternating(
+        repeats, *(_some(20, on_features(_small(algorithm=name), dataset, features)) for name in ("td3_bc", "rebrac"))
+    )
+    return rates | {"rebrac_over_td3_bc": rebrac / td3_bc}
+
+
+def _updates_per_s(
+    dataset: Dataset, encoder_config: EncoderConfig, precision: Precision, repeats: int
+) -> dict[str, float]:
+    """Rates of many cached updates in a row, as in training, and of as few exact ones as count both kinds of update."""
+    config, device = _small(), dataset.t.device
+    encoder = Encoder(encoder_config).eval().to(device)
+    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch+zero_frames"), config.shift, precision, 0)
+    features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
+    exact = next_update(
+        config, dataset, encoder.dim, lambda draws: ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, draws)
+    )
+    many, few = 20, ALGORITHMS[config.algorithm].period
+    fast, slow = alternating(max(1, repeats), _some(many, on_features(config, dataset, features)), _some(few, exact))
+    fast, slow = fast / many, slow / few
+    return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
+
+
+def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 1024)) -> dict[str, Any]:
+    """Milliseconds of a TD3+BC update, sampling included, and how many times as long float32 in JAX takes."""
+    if importlib.util.find_spec("jax") is None:
+        return {"jax": JAX_MISSING}
+    results: dict[str, Any] = {}
+    features = random_features(dataset, FinetuneConfig.of("cpu").views)
+    for hidden in widths:
+        updates = max(2, 2560 // hidden)
+        shape = {"hidden_dim": hidden, "batch_size": BATCH, "dim": features.shape[-1], "rows": dataset.num_rows}
+        shape |= {"action_dim": dataset.action_dim, "views": len(features)}
+        (theirs,) = apart("vd4rl_pomdp.bench.processes.jax_updates", shape, updates, repeats)
+        precisions = ("fp32", "bf16")
+        ours = (_small(hidden_dim=hidden, update_precision=precision) for precision in precisions)
+        seconds = alternating(repeats, *(_some(updates, on_features(config, dataset, features)) for config in ours))
+        for precision, ms in zip(precisions, (1e3 * one / updates for one in seconds), strict=True):
+            name = f"units_{hidden}_{precision}"
+            results |= {f"{name}_ms": ms, f"{name}_jax_over_ours": theirs["ms"] / ms}
+    return results
+
+
+def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Milliseconds of an update of one policy of the cpu preset, and of one of five that are trained as one."""
+    updates, runs, features = 10, 5, random_features(dataset, FinetuneConfig.of("cpu").views)
+    results: dict[str, float] = {}
+    for precision in ("fp32", "bf16"):
+        config = _small(update_precision=precision)
+        both = (_some(updates, on_features(config, dataset, features, count)) for count in (1, runs))
+        one, five = (1e3 * seconds / updates for seconds in alternating(repeats, *both))
+        results |= {f"{precision}_ms": one, f"{precision}_of_five_ms": five / runs}
+        results[f"{precision}_of_five_over_one"] = five / runs / one
+    return results
+
+
+def random_features(dataset: Dataset, views: int) -> torch.Tensor:
+    """(views, rows, D) float16, as wide as the usual frame encoder's, where the set is."""
+    width = EncoderConfig(dataset.action_dim).feature_dim
+    return torch.randn(views, dataset.num_rows, width, device=dataset.t.device).half()
+
+
+def _small(**settings: Any) -> FinetuneConfig:
+    return FinetuneConfig.of("cpu", batch_size=BATCH, **settings)
+
+
+def _some(count: int, update: Callable[[], Any]) -> Callable[[], None]:
+    """So many updates in a row."""
+
+    def updates() -> None:
+        for _ in range(count):
+            update()
+
+    return updates
+
+
+def on_features(
+    config: FinetuneConfig, dataset: Dataset, features: torch.Tensor, runs: int = 1
+) -> Callable[[], dict[str, torch.Tensor]]:
+    """The next update of a run on cached (V, N, D) features, or of so many stacked ones."""
+    histories = Histories(dataset, NO_OPTIONS, 3, 0)
+    sampler = partial(FeatureSampler, histories, features, config.batch_size, 3, 0.99)
+    return next_update(config, dataset, features.shape[-1], sampler, runs)
+
+
+def next_update(
+    config: FinetuneConfig,
+    dataset: Dataset,
+    dim: int,
+    batches: Callable[[RandomStream], Any],
+    runs: int = 1,
+    encoder: Encoder | None = None,
+) -> Callable[[], dict[str, torch.Tensor]]:
+    """The next update of a run, or of so many stacked ones, sampling included, as in training.
+
+    Args:
+        config: settings of the run.
+        dataset: its set, on the device.
+        dim: width of representations.
+        batches: makes its sampler from a random stream.
+        runs: how many are trained as one.
+        encoder: what is trained, too, of an end-to-end method.
+    """
+    device, trainers = dataset.t.device, []
+    unwritten: Any = [None] * 4  # where results would go, and what they would be compared with
+    for seed in range(runs):
+        draws, noise = (random_stream(seed, STAGE, name, device=device) for name in ("batches", "noise"))
+        policy = Policy(dim, dataset.action_dim, config.hidden_dim).to(device)
+        kind = ALGORITHMS.named(config.algorithm)
+        algorithm = kind(policy, config.options, config.learning_rate, config.updates, noise)
+        trained = algorithm if encoder is None else EndToEnd(algorithm, encoder, config)
+        trainers.append(FinetuneTrainer(trained, batches(draws), config, *unwritten))
+    updates, made = Updates(trainers), itertools.count()
+    return lambda: updates(next(made))
+
+
+def maze_training() -> dict[str, float]:
+    """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
+        collect(replace(SETS["smoke"], **shape))  # type: ignore[arg-type]
+        config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
+        data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
+        trainer, _ = make_maze_trainer(data, config, pick_device("auto"))
+    step, sampling, optimiser = alternating(5, trainer.update, trainer.batches.sample, trainer.optimiser.step)
+    return {"training_steps_per_s": 1 / step, "training_overhead_share": (sampling + optimiser) / step}

@@ -7,8 +7,7 @@ import torch
 
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.data import open_data
-from vd4rl_pomdp.studies.navigation.measure import evaluate, refitted_errors
-from vd4rl_pomdp.studies.navigation.probed import ProbedObjective, make_trainer
+from vd4rl_pomdp.studies.navigation.train import ProbedObjective, evaluate, make_trainer, refitted_errors
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.envs.mazes import FREE_CELLS, PAPER_MAZES
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.studies.navigation import figures
-from vd4rl_pomdp.studies.navigation.claims import claims, judge, verdict_lines
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import (
     OBJECTIVES,
@@ -27,7 +26,7 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_rows,
     refitted_error,
 )
-from vd4rl_pomdp.studies.navigation.report import write_report
+from vd4rl_pomdp.studies.navigation.report import claims, judge, verdict_lines, write_report
 from vd4rl_pomdp.studies.navigation.runs import (
     NavigationRun,
     find_navigation,

@@ -14,8 +14,7 @@ from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import MazeData, open_data, open_maze_set
 from vd4rl_pomdp.studies.navigation.measures import METHOD_NAMES, OBJECTIVES
 from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe, refit
-from vd4rl_pomdp.studies.navigation.probed import ProbedObjective, learning_rate, make_trainer
-from vd4rl_pomdp.studies.navigation.train import train
+from vd4rl_pomdp.studies.navigation.train import ProbedObjective, learning_rate, make_trainer, train
 
 
 @pytest.fixture(autouse=True)

@@ -23,8 +23,7 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_number,
     paper_rows,
 )
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, numbers_of, read_trajectory
-from vd4rl_pomdp.studies.navigation.tables import conditions_of, is_missing
+from vd4rl_pomdp.studies.navigation.runs import NavigationRun, conditions_of, is_missing, numbers_of, read_trajectory
 
 _ESTIMATE = "#d55e00"
 _VARIANTS = {

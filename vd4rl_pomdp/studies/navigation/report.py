@@ -9,22 +9,386 @@ OUT/figures/      accuracy.png, accuracy_raw.png (beside the paper's numbers), t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from vd4rl_pomdp.core.text import code, code_block, markdown, write_text
-from vd4rl_pomdp.envs.mazes import HARD, MAZES
+from vd4rl_pomdp.envs.mazes import HARD, MAZES, PAPER_MAZES
+from vd4rl_pomdp.report.stats import mean_interval
+from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import RUNS, Result
 from vd4rl_pomdp.studies.navigation import figures
-from vd4rl_pomdp.studies.navigation.claims import verdict_lines
-from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, refitted_error
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, find_navigation, frame_of, load_runs, save_runs
-from vd4rl_pomdp.studies.navigation.tables import make_tables, table_sections, write_tables
+from vd4rl_pomdp.studies.navigation.measures import (
+    METHOD_NAMES,
+    OBJECTIVES,
+    RAW_PREFIX,
+    REFERENCES,
+    UNTRAINED,
+    Condition,
+    Measure,
+    condition_of,
+    held_out_loss,
+    online_error,
+    paper_number,
+    paper_rows,
+    refitted_error,
+)
+from vd4rl_pomdp.studies.navigation.runs import (
+    KEYS,
+    NavigationRun,
+    conditions_of,
+    find_navigation,
+    frame_of,
+    is_missing,
+    load_runs,
+    numbers_of,
+    save_runs,
+)
+
+_REFITTED = "held-out trajectories, probe refitted on frozen states"
+PROTOCOLS = {
+    "training averages, probe trained beside the model (the paper's way)": ("training", "online"),
+    _REFITTED: ("held_out", "refit"),
+}
+"""How an error is measured: the split and the probe."""
+_LOSS_PROTOCOLS = {
+    "training averages (the paper's way)": ("training", ""),
+    "held-out trajectories": ("held_out", ""),
+}
+_UNITS = {False: "% of a standard deviation", True: "raw units x 100, beside the paper"}
+_TITLES = {
+    "state_error": "State estimation errors, K = 1 and 15",
+    "position_error": "Position errors, K = 15",
+    "velocity_error": "Velocity errors, K = 15",
+    "action_loss": "Action prediction losses (nats x 100), K = 15",
+    "self_prediction": "State estimation errors without and with self-prediction, K = 15",
+    "exogenous": "State estimation errors with exogenous noise, K = 15",
+    "exogenous_main": "State estimation errors with exogenous noise, two mazes (the main text's table)",
+    "references": "References: untrained, trained on the true states, and MIK+A whose future holds a_{t+k-1}",
+    "hidden": "Errors on steps that a curtain hides, K = 15",
+    "by_k": "Action losses (nats x 100) by k, K = 15",
+    "others": "State estimation errors of what no other table has",
+}
+_PAPER_TABLES = tuple(_TITLES)[:7]
+MAIN_TEXT = ("no_curtain", "three_curtains")
+"""Mazes of the tables in the paper's main text."""
+LITERAL = Condition("", "mik+a", 1, literal_future=True)
+Line = tuple[str, str, str, Condition, Measure]
+"""Of the layout: table, view, row, and what stands there."""
+
+
+def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
+    """The paper's six tables (position and velocity are one of them), then four of our own: one line a number.
+
+    Returns:
+        `table`, `view` and `row` where the number stands, KEYS, `numbers` by seed, their `mean`, `low` and `high` (95%
+        t interval), `seeds` and `of_seeds`, those with which the maze was trained under any condition; the `paper`'s
+        number; and whether it is `missing`, see `is_missing`.
+        Rows of a table for which neither a run nor the paper has a number are left out, and tables that no run has.
+    """
+    lines = list(_layout(frame))
+    places = [(*line[:3], *line[3], *line[4]) for line in lines]
+    cells = pd.DataFrame(places, columns=["table", "view", "row", *KEYS])
+    trained = conditions_of(frame)
+    cells["paper"] = [paper_number(condition, measure) for _, _, _, condition, measure in lines]
+    cells["missing"] = [is_missing(condition, trained) for _, _, _, condition, _ in lines]
+    groups = frame.groupby(KEYS)["value"].agg(numbers=np.array).reset_index()
+    cells = cells.merge(groups, how="left", on=KEYS)
+    cells["numbers"] = [found if isinstance(found, np.ndarray) else np.empty(0) for found in cells["numbers"]]
+    cells["seeds"] = cells["numbers"].map(len)
+    cells["of_seeds"] = cells["maze"].map(frame.groupby("maze")["seed"].nunique())
+    cells["mean"] = [found.mean() if len(found) else None for found in cells["numbers"]]
+    ends = [mean_interval(found[:, None]) if len(found) else None for found in cells["numbers"]]
+    cells[["low", "high"]] = [end or (None, None) for end in ends]
+    told = (cells["seeds"] > 0) | cells["paper"].notna()
+    of_row = [cells["table"], cells["view"], cells["row"]]
+    return cells[told.groupby(of_row).transform("any") & (cells["seeds"].groupby(of_row[:2]).transform("max") > 0)]
+
+
+def _layout(frame: pd.DataFrame) -> Iterator[Line]:
+    """What stands where in every table, table by table and row by row."""
+    mazes = {raw: _mazes(frame, raw) for raw in (False, True)}
+    for name in _PAPER_TABLES:
+        for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else PROTOCOLS).items():
+            for raw in (False,) if name == "action_loss" else (False, True):
+                view = protocol if name == "action_loss" else f"{protocol}; {_UNITS[raw]}"
+                yield from _paper_table(name, view, Measure("", split, probe), mazes[raw], raw)
+    for raw in (False, True):
+        view = f"{_REFITTED}; {_UNITS[raw]}"
+        for row, condition, measure in _references():
+            yield from _row("references", view, row, condition, measure.raw() if raw else measure, mazes[raw])
+    for raw in (False, True):
+        view, hiding = f"{_REFITTED}; {_UNITS[raw]}", [maze for maze in mazes[raw] if MAZES[maze].curtains]
+        for method in METHOD_NAMES:
+            for component in ("position", "velocity"):
+                measure = refitted_error(component, "hidden")
+                shown = measure.raw() if raw else measure
+                yield from _row("hidden", view, f"{method}, {component}", Condition("", method), shown, hiding)
+    for method in OBJECTIVES:
+        for k in (1, 5, 15):
+            where = "by_k", "held-out trajectories", f"{method}, k={k}"
+            yield from _row(*where, Condition("", method), held_out_loss(k), mazes[False])
+    others = _others(frame)
+    for raw in (False, True):
+        measure = refitted_error("state").raw() if raw else refitted_error("state")
+        for condition in others:
+            view = f"{_REFITTED}; {_UNITS[raw]}"
+            yield from _row("others", view, condition.short, condition, measure, mazes[raw])
+
+
+def _row(table: str, view: str, row: str, condition: Condition, measure: Measure, mazes: Iterable[str]) -> list[Line]:
+    return [(table, view, row, condition._replace(maze=maze), measure) for maze in mazes]
+
+
+def _mazes(frame: pd.DataFrame, raw: bool) -> list[str]:
+    """Columns of a table: the paper's mazes if any of them has runs (with raw numbers), and variants that have some."""
+    told = frame[frame["measure"].str.startswith(RAW_PREFIX)] if raw else frame
+    trained = set(told["maze"])
+    paper = trained & set(PAPER_MAZES)
+    return [maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES)]
+
+
+def _paper_table(name: str, view: str, measure: Measure, mazes: list[str], raw: bool) -> Iterator[Line]:
+    """One of the paper's tables; `measure` lacks what is measured."""
+    shown = [maze for maze in mazes if name != "exogenous_main" or MAZES[maze].paper in MAIN_TEXT]
+    for line in paper_rows():
+        if line["table"] == name.removesuffix("_main"):
+            what = line["component"] if name == "action_loss" else f"{line['component']}_error"
+            options = ", self-prediction" if line["self_prediction"] == "Y" else ""
+            label, found = f"{line['objective']}, K={line['k_max']}{options}", measure._replace(measure=what)
+            yield from _row(name, view, label, condition_of(line, ""), found.raw() if raw else found, shown)
+
+
+def _references() -> Iterator[tuple[str, Condition, Measure]]:
+    """What the paper does not show: the floor, the ceilings, and the literal future."""
+    for method in REFERENCES:
+        for component in ("state", "position", "velocity"):
+            yield f"{method}, {component}", Condition("", method), refitted_error(component)
+    yield "MIK+A, literal future, K=1, state error", LITERAL, refitted_error("state")
+    yield "MIK+A, literal future, K=1, action loss", LITERAL, held_out_loss()
+
+
+def _others(frame: pd.DataFrame) -> list[Condition]:
+    """Conditions, without their mazes, that neither the paper nor the references have."""
+    told = {condition_of(line, "") for line in paper_rows()}
+    told |= {*(Condition("", method) for method in REFERENCES), LITERAL}
+    found = frame[list(Condition._fields)].assign(maze="").drop_duplicates().itertuples(index=False)
+    return [condition for condition in (Condition(*row) for row in found) if condition not in told]
+
+
+def cell_text(cell: pd.Series) -> str:
+    """Mean, interval, seeds, and the paper's number in brackets; "no run" for one that is missing."""
+    paper = "" if pd.isna(cell["paper"]) else f"({cell['paper']:.1f})"
+    if not cell["seeds"]:
+        return f"no run {paper}".rstrip() if cell["missing"] else paper
+    spread = "" if pd.isna(cell["low"]) else f" [{cell['low']:.1f}, {cell['high']:.1f}]"
+    seeds = f"n={cell['seeds']}" + (f" of {cell['of_seeds']:.0f}" if cell["seeds"] < cell["of_seeds"] else "")
+    return f"**{cell['mean']:.1f}**{spread} {seeds} {paper}".rstrip()
+
+
+def table_sections(cells: pd.DataFrame) -> Iterator[str]:
+    """Lines of a page's part: every table under its title, a column for each maze."""
+    texts = cells.assign(text=cells.apply(cell_text, axis=1))
+    for name, title in _TITLES.items():
+        mine = texts[texts["table"] == name]
+        if mine.empty and name == "others":
+            continue
+        yield from (f"## {title}", "", *([] if len(mine) else ["No run yet.", ""]))
+        for view, table in mine.groupby("view", sort=False):
+            mazes, rows = table["maze"].unique(), table["row"].unique()
+            wide = table.pivot(index="row", columns="maze", values="text").loc[rows, mazes]
+            yield from (f"*{view}*", "", "| | " + " | ".join(mazes) + " |", "|---|" + "---|" * len(mazes))
+            yield from (f"| {label} | {' | '.join(row)} |" for label, row in zip(rows, wide.to_numpy(), strict=True))
+            yield ""
+
+
+def write_tables(cells: pd.DataFrame, path: Path) -> None:
+    """Write every number of the tables as CSV."""
+    shown = cells[(cells["seeds"] > 0) | cells["missing"]].copy()
+    for name in ("mean", "low", "high"):
+        shown[name] = ["" if pd.isna(value) else f"{value:.4g}" for value in shown[name]]
+    shown["paper"] = ["" if pd.isna(value) else value for value in shown["paper"]]
+    columns = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
+    write_csv(path, columns, shown[columns].to_dict("records"))
+
+
+RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
+NEAR_ZERO = 5.0
+"""Action loss (nats x 100) that counts as near zero; guessing among 20 codes is 300."""
+FEW = 15.0
+"""State error (% of a standard deviation) below which a first person is said to know where it is."""
+_RELATIONS = {">=": operator.ge, "<=": operator.le, "<": operator.lt, ">": operator.gt}
+ClaimSide = tuple[Condition, Measure]
+Numbers = Mapping[tuple[Any, ...], Mapping[int, float]]
+"""What `numbers_of` returns."""
+
+
+class Claim(NamedTuple):
+    """`left` compared with `factor` times `right`; without a right side, with `factor` itself."""
+
+    text: str
+    left: ClaimSide
+    relation: str
+    factor: float
+    right: ClaimSide | None = None
+
+    def raw(self) -> Claim:
+        """The same statement about errors in the simulator's units; itself where it names a bound in its own."""
+        if self.right is None:
+            return self
+        left, right = ((condition, measure.raw()) for condition, measure in (self.left, self.right))
+        return self._replace(left=left, right=right)
+
+    def holds(self, left: float, right: float) -> bool:
+        """Whether two numbers are in the relation."""
+        return bool(_RELATIONS[self.relation](left, self.factor * right))
+
+
+class Verdict(NamedTuple):
+    """A claim and what the runs say."""
+
+    claim: Claim
+    left: float
+    right: float
+    """Means over the seeds for which both numbers exist; NaN while there is none."""
+    seeds: int
+    seeds_holding: int
+    paper: tuple[float, float] | None
+    """The paper's own two numbers, where it has them and the claim is in its units."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it holds for the means over seeds."""
+        return self.seeds > 0 and self.claim.holds(self.left, self.right)
+
+
+def claims(maze: str) -> list[Claim]:
+    """The claims about one maze: first whether training has gone far enough to compare, then the paper's statements."""
+
+    def of(method: str, measure: Measure | str, max_k: int = 15, **options: bool) -> ClaimSide:
+        named = refitted_error(measure) if isinstance(measure, str) else measure
+        return Condition(maze, method, max_k, **options), named
+
+    first, last = (of("mik+a", held_out_loss(k)) for k in (1, 15))
+    best, literal = of("mik+a", "state", 1), of("mik+a", "state", 1, literal_future=True)
+    recorder, slow, place = of("ah+a", "state", 1), of("mik+a", "velocity"), of("mik+a", "position")
+    found = [
+        Claim("gate: mik+a's action loss at k=1, of that at k=15", first, "<=", 0.85, last),
+        Claim("no_history's velocity error, of mik+a's", of("no_history", "velocity"), ">=", 3, slow),
+        Claim("K=1: ah+a's state error, of mik+a's", recorder, ">=", 2, best),
+        Claim("K=1: ah+a's action loss is near zero", of("ah+a", held_out_loss(), 1), "<=", NEAR_ZERO),
+        Claim("K=1: mik+a's state error with the literal future, of the default's", literal, ">=", 2, best),
+        Claim("ah+a's position error, of mik+a's", of("ah+a", "position"), ">=", 1.5, place),
+    ]
+    if MAZES[maze].paper == "three_curtains":
+        found += [
+            Claim("mik's velocity error, of mik+a's", of("mik", "velocity"), ">=", 1.5, slow),
+            Claim("ah's state error, of mik+a's", of("ah", "state"), ">", 1, of("mik+a", "state")),
+        ]
+    if MAZES[maze].paper == "first_person":  # the place is known where a picture does not tell it, by far
+        for told, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
+            ours = of("mik+a", "state", self_prediction=told)
+            found += [
+                Claim(f"state error of {name}, of the untrained one's", ours, "<", 0.5, of(UNTRAINED, "state")),
+                Claim(f"state error of {name}", ours, "<", FEW),
+                Claim(f"no_history's state error, of that of {name}", of("no_history", "state"), ">", 1, ours),
+            ]
+        found.append(
+            Claim("ah+a's state error, of no_history's", of("ah+a", "state"), ">", 1, of("no_history", "state"))
+        )
+    for method in RECURRENT:
+        text = f"{method}'s position error, of the untrained one's"
+        found.append(Claim(text, of(method, "position"), "<", 0.5, of(UNTRAINED, "position")))
+    return found
+
+
+def judge(claim: Claim, numbers: Numbers) -> Verdict:
+    """What the runs say of a claim, over the seeds that both sides have."""
+    left = _by_seed(claim.left, numbers)
+    right = dict.fromkeys(left, 1.0) if claim.right is None else _by_seed(claim.right, numbers)
+    seeds = sorted(left.keys() & right.keys())
+    holding = sum(claim.holds(left[seed], right[seed]) for seed in seeds)
+    means = [sum(side[seed] for seed in seeds) / len(seeds) if seeds else math.nan for side in (left, right)]
+    paper = [paper_number(*claim.left), 1.0 if claim.right is None else paper_number(*claim.right)]
+    known = None if paper[0] is None or paper[1] is None else (paper[0], paper[1])
+    return Verdict(claim, means[0], means[1], len(seeds), holding, known)
+
+
+def _by_seed(side: ClaimSide, numbers: Numbers) -> Mapping[int, float]:
+    condition, measure = side
+    return numbers.get((*condition, *measure), {})
+
+
+def verdict_lines(frame: pd.DataFrame) -> list[str]:
+    """A section of a page: all statements about the mazes of some runs, whether they hold, and the paper's numbers."""
+    numbers, mazes = numbers_of(frame), set(frame["maze"])
+    pairs = [
+        (maze, judge(claim, numbers), judge(claim.raw(), numbers))
+        for maze in MAZES
+        if maze in mazes
+        for claim in claims(maze)
+    ]
+    judged = [percent for _, percent, _ in pairs if percent.seeds]
+    printed = [raw for _, _, raw in pairs if raw.seeds and raw.paper]
+    both = [(maze, percent, raw) for maze, percent, raw in pairs if raw.seeds and raw.claim != percent.claim]
+    other = [f"{maze}: {percent.claim.text}" for maze, percent, raw in both if percent.holds != raw.holds]
+    changes = f"{len(other)} change ({'; '.join(other)})" if other else "none changes"
+    recorder = ", ".join(f"{number:.1f} ({maze})" for maze, number in _paper_positions())
+    return [
+        "## Which statements hold",
+        "",
+        f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(pairs) - len(judged)} wait for runs. "
+        f"Of {len(both)} that are judged in both units, {changes}.",
+        "Wording and bounds are this package's. "
+        f"Of those for which the paper prints numbers, {sum(v.holds for v in printed)} of {len(printed)} hold.",
+        "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds` says how many hold alone.",
+        "",
+        "| maze | statement | here, % of std | holds | seeds | here, raw x 100 | holds | the paper's numbers |",
+        "|---|---|---|---|---|---|---|---|",
+        *(_verdict_row(*pair) for pair in pairs),
+        "",
+        "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
+        f"and need not keep the state. In the paper its position error is {recorder}.",
+        "",
+    ]
+
+
+def _paper_positions() -> Iterator[tuple[str, float]]:
+    """The paper's position error of ah+a, by maze."""
+    for maze in MAZES:
+        if (number := paper_number(Condition(maze, "ah+a"), online_error("position").raw())) is not None:
+            yield maze, number
+
+
+def _verdict_row(maze: str, percent: Verdict, raw: Verdict) -> str:
+    claim = percent.claim
+    bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
+    columns = [maze, f"{claim.text} {bound}", "no run yet", "-", "-", "-", "-"]
+    if percent.seeds:
+        columns[2:5] = [*_answer(percent), f"{percent.seeds_holding} of {percent.seeds}"]
+    if raw.claim == claim:
+        columns[5:] = ["no error", "-"]
+    elif raw.seeds:
+        columns[5:] = _answer(raw)
+    paper = f"{_sides(claim, *raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}" if raw.paper else "none"
+    return f"| {' | '.join([*columns, paper])} |"
+
+
+def _answer(verdict: Verdict) -> list[str]:
+    return [_sides(verdict.claim, verdict.left, verdict.right), "**yes**" if verdict.holds else "**no**"]
+
+
+def _sides(claim: Claim, left: float, right: float) -> str:
+    return f"{left:.1f} / {right:.1f}" if claim.right else f"{left:.1f}"
+
 
 Samples = Callable[[], Mapping[str, np.ndarray]]
 """Draws sample observations: (n, 3, H, W) uint8 by name."""

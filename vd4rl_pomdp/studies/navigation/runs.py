@@ -180,6 +180,20 @@ def frame_of(runs: Iterable[NavigationRun]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
+def conditions_of(frame: pd.DataFrame) -> set[Condition]:
+    """The conditions that have runs."""
+    return {Condition(*row) for row in frame[list(Condition._fields)].drop_duplicates().itertuples(index=False)}
+
+
+def is_missing(condition: Condition, trained: set[Condition]) -> bool:
+    """Whether a condition has no run, although its maze has runs and the same condition has some in another maze."""
+    return (
+        condition not in trained
+        and any(other.maze == condition.maze for other in trained)
+        and any(other[1:] == condition[1:] for other in trained)
+    )
+
+
 def numbers_of(frame: pd.DataFrame) -> dict[tuple[Any, ...], dict[int, float]]:
     """Numbers by seed, for each condition and measure: the key is `(*condition, *measure)`."""
     found: dict[tuple[Any, ...], dict[int, float]] = {}

@@ -6,26 +6,142 @@ results.json: every number the report needs, as rows of (measure, split, probe, 
 
 from __future__ import annotations
 
+import csv
+import math
 import shlex
+from collections import defaultdict
+from functools import partial
+from pathlib import Path
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from pretrain.build import build_objective, build_target
+from pretrain.train import Trainer
 from vd4rl_pomdp.core.options import flat, settings_of
+from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.streams import random_stream
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.folder import read_plan
-from vd4rl_pomdp.nn.encoder import EncoderCard
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
+from vd4rl_pomdp.nn.objective import InverseObjective, Objective
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
-from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.runs.device import autocast, pick_device
+from vd4rl_pomdp.runs.files import replacing_file, write_json
+from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
-from vd4rl_pomdp.studies.navigation.data import open_data
-from vd4rl_pomdp.studies.navigation.measure import measure, write_trajectory
-from vd4rl_pomdp.studies.navigation.measures import UNTRAINED
-from vd4rl_pomdp.studies.navigation.probed import STAGE, ProbedObjective, make_trainer
+from vd4rl_pomdp.studies.navigation.data import MazeData, open_data
+from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure, measure_rows
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES
+from vd4rl_pomdp.studies.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
+
+_SUPERVISED_RATE = 0.5
+"""Share of the learning rate that supervised references take: at the whole one, two of three seeds predict the mean."""
+STAGE = "navigation"
+
+
+class ProbedObjective(Objective):
+    """An objective beside a probe that takes no part in its gradient; the probe's error alone trains a reference."""
+
+    def __init__(self, data: MazeData, config: NavigationConfig) -> None:
+        """On the CPU, as is `data`."""
+        super().__init__()
+        trained = config.trained()
+        target = build_target(trained, data.training_actions.numpy())
+        objective = build_objective(trained, data.training_actions.shape[1], target, observation=SHAPES[config.picture])
+        assert isinstance(objective, InverseObjective)
+        self.objective, self.probe, self.errors = objective, StateProbe(objective.encoder.dim), ErrorSums()
+        self.data, self.config = data, config
+
+    @property
+    def encoder(self) -> Encoder:  # type: ignore[override]
+        """The objective's."""
+        return self.objective.encoder
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+        return next(self.parameters()).device
+
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Objective's and probe's loss of one batch; its errors count until `take_errors`."""
+        loss, logs, states = self.measured(window, progress)
+        with torch.autocast(self.device.type, enabled=False):
+            self.errors.add(*states, self.config.burn_in)
+        return loss, logs
+
+    def measured(
+        self, window: Windows, progress: float | Tensor
+    ) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        """The loss of one batch, whose frames are encoded once, with its estimated and true states and which of them
+        were hidden."""
+        past, future = self.objective.representations(window)
+        rows = self.data.dataset.rows(window.key)
+        supervised = self.config.method in SUPERVISED
+        estimate, truth = self.probe(past, frozen=not supervised), self.data.states.values[rows]
+        error = (estimate.float() - truth).square().mean()
+        states = (estimate, truth, self.data.states.hidden[rows])
+        if supervised:
+            return error, {"loss": error.detach()}, states
+        loss, logs = self.objective.loss_of(past, future, window, progress)
+        return loss + error, logs | {"probe_loss": error.detach()}, states
+
+    def after_step(self) -> None:
+        """The objective's."""
+        self.objective.after_step()
+
+    def take_errors(self) -> dict[str, float]:
+        """Mean errors since the last call."""
+        found = self.errors.both(self.data.states.std)
+        self.errors.reset()
+        return found
+
+
+class MazeBatches:
+    """Uniform training windows of a maze's set."""
+
+    def __init__(self, data: MazeData, config: NavigationConfig) -> None:
+        self._data, self._batch_size = data, config.batch_size
+        self.draws = random_stream(config.seed, STAGE, "batches", device=data.dataset.t.device)
+
+    def sample(self) -> Windows:
+        """The next batch."""
+        return self._data.windows(self.draws.integers(self._data.training, self._batch_size))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to resume with the same batches."""
+        return {"generator": self.draws.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.draws.set_state(state["generator"])
+
+
+def make_trainer(data: MazeData, config: NavigationConfig, device: torch.device) -> tuple[Trainer, ProbedObjective]:
+    """The training of a config on a maze's data, which is moved to the device, and what it trains."""
+    seed_networks(config.seed, STAGE)
+    probed = ProbedObjective(data, config).to(device)
+    return Trainer(probed, MazeBatches(data.on(device), config), config, partial(learning_rate, config)), probed
+
+
+def learning_rate(config: NavigationConfig, step: int) -> float:
+    """Adam's learning rate of a step, the first being 0."""
+    rising = min(1.0, (step + 1) / config.warm_up) if config.warm_up else 1.0
+    share = max(0, step - config.warm_up) / max(1, config.steps - config.warm_up)
+    falling = (1 + math.cos(math.pi * share)) / 2 if config.schedule == "cosine" else 1.0
+    share_taken = _SUPERVISED_RATE if config.method in SUPERVISED else 1.0
+    return config.learning_rate * rising * falling * share_taken
+
 
 RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
 """What a finished run holds."""
+TRAJECTORY_ROWS = 200
+"""Rows of the held-out trajectory whose estimated states are kept for a figure."""
 
 
 def train(config: NavigationConfig) -> RunFolder:
@@ -39,28 +155,129 @@ def train(config: NavigationConfig) -> RunFolder:
         if not run.finished:
             steps, last_averaged = 0 if config.method == UNTRAINED else config.steps, config.steps - config.average_last
             trainer.run(run, steps, " ".join(reversed(labels.values())), labels, probed.take_errors, last_averaged)
-            _conclude(run, trainer.step, probed)
+            trained, frames = run.seconds, trainer.step * config.batch_size * config.window
+            probe, rows = measure(probed, run.path / METRICS_FILE)
+            write_trajectory(run.path / TRAJECTORY_FILE, probed, probe)
+            card = EncoderCard(
+                method=config.method,
+                task=data.maze.name,
+                quality=data.maze.driver,
+                corruption=flat(CorruptionConfig()),
+                seed=config.seed,
+                steps=trainer.step,
+                preset=config.preset,
+                data=data.dataset.fingerprint,
+                settings=settings_of(run.config),
+            )
+            save_encoder(run.path / "encoder", probed.encoder, card, frames)
+            told = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
+            write_json(run.path / NAVIGATION_FILE, told | {"rows": rows})
+            run.finish(
+                seconds=round(trained, 2), steps=trainer.step, frames=frames, total_seconds=round(run.seconds, 2)
+            )
     return run
 
 
-def _conclude(run: RunFolder, steps: int, probed: ProbedObjective) -> None:
-    """Measure, and write what is kept of a run."""
-    config, data, trained = probed.config, probed.data, run.seconds
-    probe, rows = measure(probed, run.path / METRICS_FILE)
-    write_trajectory(run.path / TRAJECTORY_FILE, probed, probe)
-    card = EncoderCard(
-        method=config.method,
-        task=data.maze.name,
-        quality=data.maze.driver,
-        corruption=flat(CorruptionConfig()),
-        seed=config.seed,
-        steps=steps,
-        preset=config.preset,
-        data=data.dataset.fingerprint,
-        settings=settings_of(run.config),
-    )
-    frames = steps * config.batch_size * config.window
-    save_encoder(run.path / "encoder", probed.encoder, card, frames)
-    record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
-    write_json(run.path / NAVIGATION_FILE, record | {"rows": rows})
-    run.finish(seconds=round(trained, 2), steps=steps, frames=frames, total_seconds=round(run.seconds, 2))
+@torch.no_grad()
+def evaluate(probed: ProbedObjective) -> tuple[dict[str, float], dict[str, float]]:
+    """Action losses, and errors of the probe as trained, on held-out windows."""
+    sums: dict[str, float] = defaultdict(float)
+    errors, count = ErrorSums(), 0
+    probed.objective.eval()
+    for number in probed.data.spread(probed.config.evaluation_windows, held_out=True):
+        with autocast(probed.device, probed.config.precision):
+            _, logs, states = probed.measured(probed.data.windows(number), 1.0)
+        errors.add(*states, probed.config.burn_in)
+        count += len(number)
+        for name, value in logs.items():
+            sums[name] += float(value) * len(number)
+    return {name: value / count for name, value in sums.items()}, errors.both(probed.data.states.std)
+
+
+@torch.no_grad()
+def encode(probed: ProbedObjective, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
+    """Frozen states (B, T, D) float32 of windows, and their rows (B, T)."""
+    window = probed.data.windows(number, length)
+    with autocast(probed.device, probed.config.precision):
+        return probed.encoder.encode(window).float(), probed.data.dataset.rows(window.key)
+
+
+def refitted_errors(probed: ProbedObjective) -> tuple[StateProbe, dict[str, dict[str, float]]]:
+    """A probe fitted on frozen states of training windows, and its errors by split."""
+    config, states = probed.config, probed.data.states
+    probed.objective.eval()
+    parts = [encode(probed, number) for number in probed.data.spread(config.refit_windows, held_out=False)]
+    features, rows = (torch.cat([part[i][:, config.burn_in :].flatten(0, 1) for part in parts]) for i in (0, 1))
+    probe = refit(features, states.values[rows], config.refit_steps, config.seed)
+    found = {}
+    for split, held_out in (("training", False), ("held_out", True)):
+        errors = ErrorSums()
+        for number in probed.data.spread(config.evaluation_windows, held_out):
+            past, at = encode(probed, number)
+            errors.add(probe(past), states.values[at], states.hidden[at], config.burn_in)
+        found[split] = errors.both(states.std)
+    return probe, found
+
+
+def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
+    """The probe refitted on frozen states, and all rows that `results.json` keeps; `log` is the run's metrics.jsonl."""
+    probe, refitted = refitted_errors(probed)
+    values: dict[Measure, float] = {}
+    for split, errors in refitted.items():
+        values |= _errors(split, "refit", errors)
+    if probed.config.method == UNTRAINED:  # its online probe and its action head were never trained
+        return probe, measure_rows(values)
+    losses, online = evaluate(probed)
+    averages = _training_averages(log, probed.config)
+    values |= _errors("held_out", "online", online) | _errors("training", "online", averages)
+    if "action_loss" in losses:
+        values |= _losses("training", averages) | _losses("held_out", losses)
+    return probe, measure_rows(values)
+
+
+def _errors(split: str, probe: str, logs: dict[str, float]) -> dict[Measure, float]:
+    """Errors among the numbers that are logged: those that `ErrorSums.both` names."""
+    values = {}
+    for name, value in logs.items():
+        error = name.removesuffix("_hidden")
+        if error.removeprefix(RAW_PREFIX) in COMPONENTS:
+            rows = "hidden" if name.endswith("_hidden") else "all"
+            values[Measure(f"{error}_error", split, probe, rows)] = value
+    return values
+
+
+def _losses(split: str, logs: dict[str, float]) -> dict[Measure, float]:
+    """Action losses in nats x 100, as in the paper's table: k = 0 stands for the mean over all pairs."""
+    by_k = {0: logs["action_loss"]} | {int(n[6:]): v for n, v in logs.items() if n.startswith("loss_k")}
+    return {Measure("action_loss", split, "", k=k): 100 * value for k, value in by_k.items()}
+
+
+def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
+    """Means over the last `average_last` steps: of the rows that are logged in them, each as often as it has steps."""
+    before: float = max(0, config.steps - config.average_last)
+    sums: dict[str, float] = defaultdict(float)
+    counts: dict[str, float] = defaultdict(float)
+    for row in read_metrics(path):
+        if row["step"] > before:
+            for name, value in row.items():
+                sums[name] += value * (row["step"] - before)
+                counts[name] += row["step"] - before
+            before = row["step"]
+    return {name: total / counts[name] for name, total in sums.items()}
+
+
+def write_trajectory(path: Path, probed: ProbedObjective, probe: StateProbe) -> None:
+    """True and estimated states of the first held-out trajectory, read as one stream."""
+    dataset, states = probed.data.dataset, probed.data.states
+    length = min(TRAJECTORY_ROWS, int((dataset.episode_end - dataset.episode_start).min()))
+    first = int(dataset.windows_per_episode(length)[: probed.data.first_held_out].sum())
+    past, rows = encode(probed, torch.tensor([first]), length)
+    estimate = (probe(past)[0].detach() * states.std + states.mean).cpu()
+    truth = (states.values[rows[0]] * states.std + states.mean).cpu()
+    with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = ("x", "y", "vx", "vy")
+        writer.writerow(["t", *names, *(f"estimated_{name}" for name in names), "hidden"])
+        for t, hidden in enumerate(states.hidden[rows[0]].tolist()):
+            numbers = [*truth[t].tolist(), *estimate[t].tolist()]
+            writer.writerow([t, *(f"{number:.5f}" for number in numbers), int(hidden)])

@@ -1,0 +1,157 @@
+"""Measure the policies that the ladder kept: cloning losses, or what means of them return.
+
+    python tools/ladder_policies.py cloning --work DIR     # from the folder that the ladder was started in
+    OMP_NUM_THREADS=1 python tools/ladder_policies.py averages --work DIR
+
+`cloning` adds to results/ladder/cloning.csv what it lacks, a row for every finished run and rung: losses on episodes of
+the run's own set and on held-out ones, which are collected once into DIR/held_out. `averages` adds to averaged.csv: at
+every second rung the weights of the rungs in the last half of the updates so far are averaged, and the mean policy
+plays the rung's episodes.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from script import run_script
+
+from finetune.features import FrozenEncoder
+from vd4rl_pomdp.core.reading import read_tensors
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
+from vd4rl_pomdp.data.folder import PROVENANCE
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs import CONFIG_FILE, LABELS_FILE, TIMING_FILE
+from vd4rl_pomdp.runs.files import read_json, write_csv
+
+RESULTS = Path(__file__).parents[1] / "results" / "ladder"
+SEED = 10_000
+"""Collection seed of the held-out episodes: no training set has it."""
+EPISODES = 20
+"""Held-out episodes, and episodes of a run's own set beside them, evenly spaced."""
+_PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Measure what a table of results/ladder lacks."""
+
+    what: tyro.conf.Positional[Literal["cloning", "averages"]]
+    work: Path
+    """Folder of runs, sets and snapshots; held-out episodes are collected there, too."""
+    out: Path | None = None
+    """The table; default: the one in results/ladder."""
+
+
+def main(config: Config) -> None:
+    """Measure run after run, and keep each at once."""
+    measure, file, columns, order = TABLES[config.what]
+    out = config.out or RESULTS / file
+    rows: list[dict[str, Any]] = list(csv.DictReader(out.open(newline=""))) if out.exists() else []
+    known = {(row["run"], int(row["step"])) for row in rows}
+    runs = config.work / "runs"
+    for run in sorted(path.parent for path in runs.rglob(f"finetune-*/{TIMING_FILE}")):
+        name = run.relative_to(runs).as_posix()
+        kept = {int(file.stem): file for file in (config.work / "snapshots" / name).glob("*.safetensors")}
+        lacking = [step for step in sorted(kept) if (name, step) not in known]
+        if lacking:
+            print(name, file=sys.stderr)
+            found = measure(run, kept, lacking, config.work)
+            rows += [dict(zip(columns, (name, *row), strict=True)) for row in found]
+            rows.sort(key=lambda row: (row["run"], *(int(row[column]) for column in order)))
+            write_csv(out, columns, rows)
+
+
+def cloning(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
+    """Update, loss on the run's own set and loss on held-out episodes, of a run's policies."""
+    made = read_json(run / CONFIG_FILE)["collection"]
+    held_out = work / "held_out" / made["task"] / made["quality"]
+    if not (held_out / PROVENANCE).exists():
+        collect(CollectConfig(made["task"], made["quality"], held_out, EPISODES, SEED, episodes_per_shard=10))
+    losses = [cloning_losses(run, [kept[step] for step in lacking], data) for data in (None, held_out)]
+    return [(step, f"{own:.6f}", f"{other:.6f}") for step, own, other in zip(lacking, *losses, strict=True)]
+
+
+@torch.no_grad()
+def cloning_losses(run: Path, files: list[Path], data: Path | None) -> list[float]:
+    """Mean squared differences of the actions of a run's policies from a set's, over decisions and dimensions.
+
+    The set is seen under the run's corruption, in a draw that it did not learn from, and unshifted, as it is played.
+
+    Args:
+        run: its folder, with the encoder.
+        files: of the policies.
+        data: the set; None: the run's own.
+    """
+    config = read_json(run / CONFIG_FILE)["config"]
+    record = read_json(run / "encoder" / CONFIG_FILE)
+    told = record["encoder"]
+    if "gru_layers" in told:  # a folder that is older than a memory's own options
+        layers = told.pop("gru_layers")
+        told["memory_options"] = {"gru_layers": layers} if told["history"] == "gru" else {}
+    encoder = Encoder(EncoderConfig(**told))
+    encoder.load_state_dict(read_tensors(run / "encoder" / "model.safetensors"))
+    dataset, corruption = open_dataset(data or config["data"]), CorruptionConfig.fill(record["pretrain"]["corruption"])
+    frozen = FrozenEncoder(encoder.eval(), dataset, corruption, 0, config["precision"], config["seed"])
+    policies = [Policy(**read_json(run / "policy" / CONFIG_FILE)) for _ in files]
+    for policy, file in zip(policies, files, strict=True):
+        policy.load_state_dict(read_tensors(file))
+        policy.eval()
+    squares: list[list[np.ndarray]] = [[] for _ in policies]
+    view = frozen.view(config["views"])
+    for number in np.unique(np.linspace(0, dataset.num_episodes - 1, EPISODES).astype(int)).tolist():
+        states, actions = frozen.episode(number, view)[:-1], dataset.action[dataset.rows_of(number)][1:]
+        for policy, found in zip(policies, squares, strict=True):
+            found.append((policy(states) - actions).square().mean(1).numpy())
+    return [float(np.concatenate(found).mean()) for found in squares]
+
+
+def averages(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
+    """Update, number of averaged rungs, episode and return, of the mean policies of a run that trains its encoder."""
+    found: list[tuple[Any, ...]] = []
+    labels, config = read_json(run / LABELS_FILE), read_json(run / CONFIG_FILE)["config"]
+    for step in sorted(kept)[3::2] if labels["method"] != "random" else []:
+        if step in lacking:
+            files = [kept[rung] for rung in sorted(kept) if step / 2 < rung <= step]
+            scratch = work / "averaged"
+            shutil.rmtree(scratch, ignore_errors=True)
+            shutil.copytree(run, scratch, ignore=shutil.ignore_patterns("checkpoints"))
+            tensors = [load_file(file) for file in files]
+            mean = {
+                name: torch.stack([each[name].double() for each in tensors]).mean(0).to(last.dtype)
+                for name, last in tensors[-1].items()
+            }
+            with safe_open(files[-1], "pt") as file:
+                save_file(mean, scratch / "policy" / "model.safetensors", metadata=file.metadata())
+            under = ["--corruption", labels["corruption"], "--episodes", str(config["eval_episodes"])]
+            words = [_PROGRAM, "evaluate", str(scratch), *under, "--workers", "1", "--json"]
+            told = json.loads(subprocess.run(words, stdout=subprocess.PIPE, check=True).stdout)
+            for each in told["under"][labels["corruption"]]["episodes"]:
+                found.append((step, len(files), each["episode"], round(each["return"], 4)))
+    return found
+
+
+TABLES = {
+    "cloning": (cloning, "cloning.csv", ("run", "step", "trained_on", "held_out"), ("step",)),
+    "averages": (averages, "averaged.csv", ("run", "step", "rungs", "episode", "return"), ("step", "episode")),
+}
+"""What is measured: by which function, the file, its columns, and what orders a run's rows."""
+
+
+if __name__ == "__main__":
+    run_script(main, Config)

@@ -1,6 +1,0 @@
-"""`python -m vd4rl_pomdp.cli` is `vd4rl-pomdp`."""
-
-from vd4rl_pomdp.cli import main
-
-if __name__ == "__main__":
-    main()
