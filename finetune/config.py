@@ -110,8 +110,8 @@ class FinetuneConfig(StageConfig):
             "checkpoint_every": 20,
         },
     }
-    """`paper` is the full setting, `cpu` the budget for two cores that results/ladder chose, `smoke` shows in seconds that
-    all works."""
+    """`paper` is the full setting, `cpu` the budget that results/ladder chose for two cores, `smoke` shows in seconds
+    that all works."""
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
