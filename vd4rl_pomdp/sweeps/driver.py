@@ -14,7 +14,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from pathlib import Path
 from vd4rl_pomdp.core.errors import TEMPORARY, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.runs import interrupt
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.folder import (
     DONE,
@@ -374,10 +373,8 @@ def in_stacks(
         attempts: at them, by name.
         alike: equal for jobs that stack; false for one that does not.
     """
-    groups: dict[Hashable, list[Job]] = defaultdict(list)
-    for job in jobs:
-        groups[job.name if runs_alone(attempts.get(job.name, ())) else alike(job) or job.name].append(job)
-    return [group[first : first + size] for group in groups.values() for first in range(0, len(group), size)]
+    found = groups(jobs, lambda job: job.name if runs_alone(attempts.get(job.name, ())) else alike(job) or job.name)
+    return [group[first : first + size] for group in found.values() for first in range(0, len(group), size)]
 
 
 def words_of_stack(jobs: list[Job]) -> list[str]:
