@@ -158,7 +158,9 @@ def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(
     assert add_results([run], tmp_path / "out") == "1 run added"
     for out in ("out", "report"):
         assert [(found.finished, found.rows[-1]["score"]) for found in read_results(tmp_path / out)] == [(True, 2.0)]
-    assert add_results([diverged], tmp_path / "out") == (0, 0, 1, 0), "and never the other way round"
+    assert add_results([diverged], tmp_path / "out").startswith("0 runs added, 1 there already with other rows"), (
+        "and never the other way round"
+    )
 
 
 def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
