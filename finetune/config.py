@@ -90,7 +90,14 @@ class FinetuneConfig(StageConfig):
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"update_precision": "tf32"},
-        "cpu": {"updates": 50_000, "hidden_dim": 256, "precision": "bf16", "eval_every": 25_000},
+        "cpu": {
+            "updates": 60_000,
+            "hidden_dim": 256,
+            "views": 16,
+            "precision": "bf16",
+            "update_precision": "bf16",
+            "eval_every": 60_000,
+        },
         "smoke": {
             "updates": 40,
             "batch_size": 16,
@@ -103,7 +110,8 @@ class FinetuneConfig(StageConfig):
             "checkpoint_every": 20,
         },
     }
-    """`paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
+    """`paper` is the full setting, `cpu` the budget that results/ladder chose for two cores, `smoke` shows in seconds
+    that all works."""
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:

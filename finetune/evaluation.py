@@ -24,14 +24,12 @@ from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.policy import load_policy, policy_step
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, TIMING_FILE
-from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.episodes import EVALUATION_SEED, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import Result, read_run
 from vd4rl_pomdp.runs.workers import run_jobs
 
-EVALUATION_SEED = 20_000
-"""Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
 FILM_EVERY = 4
 """Rows between two pictures of a film."""
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
-from vd4rl_pomdp.agents import CARD, checksums, write_rounded
+from finetune.evaluation import Episode, episode_rows, evaluate, jobs_of, own_and_none
+from vd4rl_pomdp.agents import CARD, checksums, find_agent, write_rounded
 from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.tasks import MOST_EPISODES, TASKS
@@ -69,6 +69,34 @@ def replay_agent(folder: Path) -> Row:
     """What the first episode of an agent's card gives here."""
     card = read_json(folder / CARD)
     return _played(folder, card, card["length"], [CorruptionConfig.fill(card["corruption"])], 1, 1)[0]
+
+
+def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple[list[Row], list[list[Episode]]]:
+    """The same episodes by several agents of a task, under the corruption of the first; the first one is filmed.
+
+    Args:
+        names: agents that ship, or folders.
+        episodes: how many each plays.
+        workers: processes, 0 for every core.
+
+    Returns:
+        The agents' cards, and their episodes.
+
+    Raises:
+        UserError: an agent is unknown or damaged, or their tasks differ.
+    """
+    refuse_number("episodes", episodes, 1, MOST_EPISODES)
+    refuse_number("workers", workers, 0)
+    found = [find_agent(name) for name in names]
+    cards = [card for _, card in found]
+    if len({card["task"] for card in cards}) > 1:
+        raise UserError(
+            f"agents of one task can be compared, and not of {' and '.join(card['task'] for card in cards)}"
+        )
+    task, under = TASKS.named(cards[0]["task"]), [CorruptionConfig.fill(cards[0]["corruption"])]
+    jobs = [job for folder, card in found for job in jobs_of(folder, task, under, episodes, card["length"], film=True)]
+    played = evaluate(jobs, workers)
+    return cards, [played[start : start + episodes] for start in range(0, len(played), episodes)]
 
 
 def _played(

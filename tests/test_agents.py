@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
 from finetune.evaluation import EVALUATION_SEED
@@ -12,14 +13,14 @@ from tests.helpers_report import pretraining
 from tests.helpers_stages import smoke_finetune
 from tests.runs.results.test_results import whole_run
 from vd4rl_pomdp import load_agent
-from vd4rl_pomdp.agents import FILES, SHIPPED
+from vd4rl_pomdp.agents import FILES, SHIPPED, shipped
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
-from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import read_run
 
@@ -45,6 +46,16 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
             now = env.step(agent.act(now.obs.numpy()))
             rewards.append(now.time_step.reward)
         assert (round(float(np.cumsum(rewards)[-1]), 4), len(rewards)) == (row["return"], row["length"])
+    film = tmp_path / "film.webp"
+    main(["agents", "play", str(out), str(out), "--episodes", "2", "--film", str(film), "--workers", "1"])
+    head, first, second, less, written = capsys.readouterr().out.splitlines()
+    assert head.startswith(f"2 episodes of {card['task']} under patch+zero_frames")
+    mean = np.mean([row["return"] for row in card["episodes"][:2]])
+    assert first == second
+    assert first.split("[")[0].split() == ["mik+a,", "seed", "0", f"{mean:.0f}"]
+    assert (less.split()[-1], written) == ("0", f"film: {film}"), "no interval where nothing differs"
+    with Image.open(film) as moving:
+        assert (moving.n_frames, moving.size) == (2, (4 * 172, 2 * 194))
     for name in FILES:
         if name.endswith(".safetensors"):
             whole, half = load_file(run / name), load_file(out / name)
@@ -53,6 +64,10 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
     with pytest.raises(SystemExit):
         main(["agents", "export", str(run), "--out", str(out)])
     assert f"{out}: is not empty; choose another --out" in capsys.readouterr().err
+    for film, told in ((tmp_path, "is a folder"), (run / "film.webp", "lies inside")):
+        with pytest.raises(SystemExit):
+            main(["agents", "play", str(out), "--film", str(film)])
+        assert told in capsys.readouterr().err
     for name in FILES:
         whole = (out / name).read_bytes()
         (out / name).write_bytes(whole + b" ")
@@ -79,13 +94,13 @@ def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
 def test_an_unknown_name_lists_what_ships(tmp_path):
     with pytest.raises(UserError) as told:
         load_agent("walker_walk/medium_expert/patch/mine")
-    assert f"the package ships {', '.join(read_json(SHIPPED / 'index.json')) or 'none'}" in str(told.value)
+    assert f"the package ships {', '.join(shipped()) or 'none'}" in str(told.value)
     assert "\n" not in str(told.value)
 
 
 def test_those_that_ship_play_their_first_episode_to_the_digit():
-    for name, place in read_json(SHIPPED / "index.json").items():
-        card = read_json(SHIPPED / place / "card.json")
-        assert load_agent(name).card == card
+    for name in shipped():
+        card = load_agent(name).card
+        assert name.startswith(f"{card['task']}/{card['quality']}/{card['corruption']['corruption']}/{card['method']}")
         if (card["render"], card["processor"]) == (render_info(card["task"]), machine("cpu")["processor"]):
-            assert replay_agent(SHIPPED / place) == card["episodes"][0]
+            assert replay_agent(SHIPPED / name) == card["episodes"][0]

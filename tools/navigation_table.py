@@ -26,10 +26,9 @@ from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_ru
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
 REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
 """In percent, on held-out trajectories."""
-REFITTED_RAW = [error.raw() for error in REFITTED]
 PAPERS_WAY = [online_error(component).raw() for component in ("state", "position", "velocity")]
-MEASURES = (*PAPERS_WAY, *REFITTED, *REFITTED_RAW)
-"""Of a maze's table: the paper's way and units, then both units by the refitted probe."""
+MEASURES = (*PAPERS_WAY, *REFITTED)
+"""Of a maze's table: the paper's way and units, then percent by the refitted probe."""
 REFERENCES = {
     UNTRAINED: "untrained",
     "supervised+a": "`supervised+a`",
@@ -37,12 +36,7 @@ REFERENCES = {
     "supervised_picture": "`supervised_picture`",
 }
 """Methods that no objective trains, as the pages call them."""
-HARD_SPREADS = {
-    **dict.fromkeys(("hard_no_curtain", "hard_one_curtain", "hard_three_curtains"), ((0.66, 0.85), (2.26, 2.44))),
-    "hard_first_person": ((0.81, 0.93), (1.65, 1.87)),
-}
-"""The lesser and the greater deviation of position and of velocity in the sets, which were collected again for them:
-a percentage is a mean over both coordinates, so the raw error lies between its products with the two."""
+HARD = ("hard_no_curtain", "hard_one_curtain", "hard_three_curtains", "hard_first_person")
 STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
 """Pictures other than the preset's, as the pages call them."""
@@ -94,12 +88,12 @@ def _head(columns: Sequence[str]) -> Iterator[str]:
 
 def maze_lines(numbers: Numbers, maze: str) -> Iterator[str]:
     """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
-    yield from _head(("seeds", "state", "position", "velocity", "state, position, velocity in %", "the same raw x 100"))
+    yield from _head(("seeds", "state", "position", "velocity", "state, position, velocity in %"))
     ranked = sorted(OBJECTIVES, key=lambda name: np.mean(values(numbers, Condition(maze, name), MEASURES[0])))
     for method in (*ranked, *REFERENCES):
         condition = Condition(maze, method)
         cells = [_cell(numbers, condition, one) for one in PAPERS_WAY]
-        cells += [", ".join(_mean(numbers, condition, one) for one in unit) for unit in (REFITTED, REFITTED_RAW)]
+        cells.append(", ".join(_mean(numbers, condition, one) for one in REFITTED))
         yield f"| {_called(method)} | {len(values(numbers, condition, REFITTED[0]))} | {' | '.join(cells)} |"
 
 
@@ -119,11 +113,10 @@ def state_lines(numbers: Numbers, ks: Sequence[int]) -> Iterator[str]:
 
 
 def texture_lines(numbers: Numbers) -> Iterator[str]:
-    """State errors at K = 15 with textures in the pictures, and without them."""
+    """State errors at K = 15 with textures in the pictures."""
     yield from _head(["seeds", *(f"`{name}`" for name in _ORDER)])
     for maze in _measured(numbers):
-        if with_them := list(_state_lines(numbers, "textures", Condition(maze, "", exogenous=True))):
-            yield from (*with_them, *_state_lines(numbers, "without", Condition(maze, "")))
+        yield from _state_lines(numbers, "textures", Condition(maze, "", exogenous=True))
 
 
 def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
@@ -155,36 +148,36 @@ def _state_lines(numbers: Numbers, words: str, cell: Condition) -> Iterator[str]
 def first_person_lines(numbers: Numbers) -> Iterator[str]:
     """Errors under the compass of all that was trained there, those with the smallest state errors first."""
     beside = "probe beside the model: position, velocity"
-    yield from _head(("seeds", "state, position, velocity", "raw x 100", beside, "raw x 100"))
+    yield from _head(("seeds", "state, position, velocity", beside))
     told = {
         f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
         for name in OBJECTIVES
         for words in ("", " with self-prediction")
     } | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
     online = [one._replace(probe="online") for one in REFITTED[1:]]
-    measures = [*REFITTED, *REFITTED_RAW, *online, *(one.raw() for one in online)]
+    measures = [*REFITTED, *online]
     state = {name: values(numbers, condition, REFITTED[0]) for name, condition in told.items()}
     for name in sorted(filter(state.get, told), key=lambda one: np.mean(state[one])):
         cells = [_cell(numbers, told[name], one) for one in measures]
-        columns = " | ".join(", ".join(cells[i:j]) for i, j in pairwise((0, 3, 6, 8, 10)))
+        columns = " | ".join(", ".join(cells[i:j]) for i, j in pairwise((0, 3, 5)))
         yield f"| {name} | {len(state[name])} | {columns} |"
 
 
 def first_rung_lines(numbers: Numbers) -> Iterator[str]:
-    """Errors of position and velocity at the smallest budget, under the stars and under the compass, in both units."""
-    yield from _head((f"`{STARS}`", "raw x 100", f"`{COMPASS}`", "raw x 100"))
+    """Errors of position and velocity at the smallest budget, under the stars and under the compass."""
+    yield from _head((f"`{STARS}`", f"`{COMPASS}`"))
     for method in (*REFERENCES, "no_history", "mik+a", "ah+a"):
         cells = [_place_and_speed(numbers, Condition(maze, method)) for maze in (STARS, COMPASS)]
         yield f"| {_called(method)} | {' | '.join(cells)} |"
 
 
 def picture_lines(usual: Numbers) -> Iterator[str]:
-    """Errors of position and velocity under the stars by what is changed, in both units, below those of the preset.
+    """Errors of position and velocity under the stars by what is changed, below those of the preset.
 
     Each changed setting has one seed; `usual` are numbers of the preset.
     """
     methods = ("supervised_picture", "supervised", "mik+a")
-    yield from _head([words for name in methods for words in (_called(name), "raw x 100")])
+    yield from _head([_called(name) for name in methods])
     groups: dict[str, list[NavigationRun]] = {}
     for result in read_results(RESULTS / "first_person" / "pictures"):
         config = result.record["config"]
@@ -197,22 +190,15 @@ def picture_lines(usual: Numbers) -> Iterator[str]:
 
 
 def _place_and_speed(numbers: Numbers, condition: Condition) -> str:
-    """Two cells: errors of position and velocity by the refitted probe, in percent and in raw units."""
-    units = REFITTED[1:], REFITTED_RAW[1:]
-    return " | ".join(", ".join(_mean(numbers, condition, error) for error in unit) for unit in units)
+    """Errors of position and velocity by the refitted probe, in percent."""
+    return ", ".join(_mean(numbers, condition, error) for error in REFITTED[1:])
 
 
 def hard_lines(numbers: Numbers) -> Iterator[str]:
-    """Errors of position and velocity at K = 15 in the harder mazes, with what they can be in raw units."""
-    yield from _head([f"`{maze}`" for maze in HARD_SPREADS])
+    """Errors of position and velocity at K = 15 in the harder mazes."""
+    yield from _head([f"`{maze}`" for maze in HARD])
     for method in (*_ORDER, *REFERENCES):
-        cells = []
-        for maze, spreads in HARD_SPREADS.items():
-            parts = []
-            for error, spread in zip(REFITTED[1:], spreads, strict=True):
-                if found := values(numbers, Condition(maze, method), error):
-                    low, high = (np.mean(found) * deviation for deviation in spread)
-                    parts.append(f"{mean_and_error(found, 1)} ({low:.1f} to {high:.1f})")
-            cells.append(", ".join(parts))
-        if any(cells):
-            yield f"| {_called(method)} | {' | '.join(cell or '–' for cell in cells)} |"
+        conditions = [Condition(maze, method) for maze in HARD]
+        if any(values(numbers, condition, REFITTED[1]) for condition in conditions):
+            cells = [_place_and_speed(numbers, condition).replace("–, –", "–") for condition in conditions]
+            yield f"| {_called(method)} | {' | '.join(cells)} |"

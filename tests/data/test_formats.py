@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import gymnasium
+import h5py
 import numpy as np
 import pytest
 
@@ -22,6 +23,12 @@ from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.sweeps.plan import DataSet
 
 LENGTHS = [20, 25, 9]
+KEYS = [
+    ("image", (84, 84, 3), np.uint8),
+    ("action", (6,), np.float32),
+    *((key, (), np.float64) for key in ("reward", "discount", "is_first", "is_last", "is_terminal")),
+]
+"""An episode's arrays in V-D4RL's .npz files: name, shape of a row, dtype."""
 BOUNDS = np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32)
 
 
@@ -199,19 +206,28 @@ def test_minari_writes_to_a_relative_path_and_a_damaged_set_is_told(minari, tmp_
     ("changed", "message"),
     [
         ({"reward": np.full(5, np.nan)}, "'reward' is not finite"),
-        ({"reward": np.zeros(4)}, r"'reward' has shape \(4,\)"),
+        ({"reward": np.zeros(4)}, "'image' has 5 rows, 'reward' 4"),
+        ({"is_last": np.ones(3)}, "'is_last' has 3 rows, 'reward' 5"),
+        ({"is_first": np.ones(6)}, "'is_first' has 6 rows, 'reward' 5"),
+        ({"discount": np.ones(1)}, "'discount' has 1 rows, 'reward' 5"),
         ({"action": np.zeros((5, 3), np.float32)}, "not those of the episodes before"),
         ({"image": np.zeros((5, 84, 84, 3), np.float32)}, "float32 pictures"),
-        ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "not those of the episodes before"),
+        ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "pictures of 32x32 pixels, its set tells of 84x84"),
+        *(({key: np.zeros((n, *of), kind) for key, of, kind in KEYS}, "has no step") for n in (0, 1)),
     ],
 )
-def test_a_damaged_episode_is_named_before_anything_of_it_is_written(changed, message, tmp_path):
+def test_a_damaged_episode_is_named_and_nothing_is_left_behind(changed, message, tmp_path, capsys):
     export_set("vd4rl_npz", write_fake_set(tmp_path / "own", [5, 5]), tmp_path / "npz")
     with np.load(file := tmp_path / "npz" / "000001-5.npz") as stored:
         np.savez(file, **(dict(stored) | changed))
-    with pytest.raises(UserError, match=f"npz: episode 1: .*{message}"):
-        import_set("vd4rl_npz", str(tmp_path / "npz"), tmp_path / "set")
-    assert not list((tmp_path / "set").glob("*.hdf5"))
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "new" / "set")])
+    assert ended.value.code == 2
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if not line.startswith("import: "))
+    assert "npz: episode 1: " in line
+    assert message in line
+    assert not (tmp_path / "new").exists()
 
 
 def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
@@ -225,7 +241,7 @@ def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
     assert "episodes of a single row" in told
     assert "discounts other than" in told
     with pytest.raises(UserError, match="call the folder walker-v0"):
-        export_set("minari", tmp_path / "own", tmp_path / "walker")
+        export_set("minari", tmp_path / "own", tmp_path / "walkers" / "walker")
     assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
     with pytest.raises(UserError, match="test/none-v0: is neither a folder of Minari's nor a set it has"):
         import_set("minari", "test/none-v0", tmp_path / "set")
@@ -261,6 +277,36 @@ def test_ogbenchs_own_transitions_are_ours(tmp_path):
     np.testing.assert_array_equal(ends, theirs["terminals"])
     assert (dataset.discount == 1).all()  # a time limit
     assert (dataset.task, dataset.frame_size) == ("visual-x-play-v0", 64)
+
+
+@pytest.mark.parametrize("key", ["observations", "actions", "terminals"])
+def test_ogbenchs_arrays_are_of_one_length(key, tmp_path):
+    path = write_ogbench(
+        tmp_path / "x-v0.npz", [(np.zeros((4, 64, 64, 3), np.uint8), np.zeros((4, 2), np.float32))] * 2
+    )
+    with np.load(path) as stored:
+        np.savez(path, **(dict(stored) | {key: stored[key][:4]}))
+    told = [4 if name == key else 8 for name in ("observations", "actions", "terminals")]
+    with pytest.raises(UserError, match=r"x-v0.npz: has {} pictures, {} actions and {} terminals".format(*told)):
+        import_set("ogbench", str(path), tmp_path / "set")
+    write_ogbench(path, [(np.zeros((1, 64, 64, 3), np.uint8), np.zeros((1, 2), np.float32))])
+    with pytest.raises(UserError, match=r"x-v0.npz: episode 0: has no step"):
+        import_set("ogbench", str(path), tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize("key", ["observations", "actions", "rewards", "terminations", "truncations", "infos/physics"])
+def test_minaris_arrays_are_of_one_length(minari, key, tmp_path):
+    folder = write_fake_set(tmp_path / "own", [5, 5], physics_dim=18, attributes={"task": "walker_walk"})
+    export_set("minari", folder, tmp_path / "a-v0")
+    with h5py.File(tmp_path / "a-v0" / "data" / "main_data.hdf5", "r+") as file:
+        episode = file["episode_1"]
+        shorter = episode[key][:-1]
+        del episode[key]
+        episode[key] = shorter
+    with pytest.raises(UserError, match="a-v0: episode 1: "):
+        import_set("minari", str(tmp_path / "a-v0"), tmp_path / "set")
+    assert not (tmp_path / "set").exists()
 
 
 def test_an_ogbench_set_of_states_or_a_cut_file_is_refused(tmp_path):

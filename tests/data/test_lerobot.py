@@ -19,6 +19,7 @@ arrow = pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 pq = pytest.importorskip("pyarrow.parquet")
 LENGTHS = [20, 25, 9]
+PICTURE = "observation.image"
 DATA, INDEX = (f"{part}/chunk-000/file-000.parquet" for part in ("data", "meta/episodes"))
 
 
@@ -72,6 +73,7 @@ def as_others_write(folder, scale=1.0):
     shorter = arrow.array([length - 1 for length in LENGTHS])
     rewrite(folder, lambda t: t.set_column(t.schema.get_field_index("length"), "length", shorter), INDEX)
     tell(folder, lambda info: info["features"].pop("next.discount"))
+    tell(folder, lambda info: info.update(total_frames=sum(LENGTHS) - 3))
 
 
 def test_pictures_in_the_rows_lose_nothing(tmp_path, capsys):
@@ -172,6 +174,12 @@ def test_one_of_several_cameras(exported, tmp_path):
         (lambda out: (out / "meta" / "info.json").unlink(), "no LeRobot set on this disk"),
         (lambda out: tell(out, lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
         (lambda out: tell(out, lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
+        (lambda out: tell(out, lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
+        (lambda out: tell(out, lambda info: info.pop("features")), r"info.json: its features is missing or damaged"),
+        (lambda out: tell(out, lambda info: info.update(fps="20")), r"info.json: its fps is missing or damaged"),
+        (lambda out: tell(out, lambda info: info["features"].update(action=[])), "its action is missing or damaged"),
+        (lambda out: tell(out, lambda i: i["features"][PICTURE].update(shape=[64, 64, 3])), "84x84 pixels, .* 64x64"),
+        (lambda out: tell(out, lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
         (lambda out: (out / DATA).unlink(), "No such file"),
         (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
         (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "has not the rows"),
@@ -182,6 +190,7 @@ def test_what_cannot_be_read_is_told(exported, damage, message, tmp_path):
     damage(exported[0])
     with pytest.raises(UserError, match=message):
         import_set("lerobot", str(exported[0]), tmp_path / "back")
+    assert not (tmp_path / "back").exists()
 
 
 def test_video_of_an_odd_size_is_refused(exported, tmp_path):

@@ -4,8 +4,7 @@
 
 The card tells task, quality and fingerprint of the set, corruption, method, algorithm, seed, budget, the run's id and
 commit, the episodes of the rounded weights, what drew and computed them (digits are the same where renderer and kind of
-processor are), and the SHA-256 of the other files. What ships lies in this package's folder; index.json beside it tells
-the folder of every name.
+processor are), and the SHA-256 of the other files. What ships lies below this package's folder: its place is its name.
 """
 
 from __future__ import annotations
@@ -78,17 +77,27 @@ def load_agent(name: Path | str) -> Agent:
     Raises:
         UserError: there is none, or its files are damaged.
     """
-    index = read_json(SHIPPED / "index.json")
-    folder = SHIPPED / index[str(name)] if str(name) in index else Path(name)
-    if not (folder / CARD).exists():
+    folder, card = find_agent(name)
+    return Agent(load_encoder(folder / "encoder", card["task"])[0], load_policy(folder / "policy"), card)
+
+
+def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
+    """Folder and card of an agent, its files checked; raises as `load_agent` does."""
+    folder = next((place for place in (SHIPPED / name, Path(name)) if (place / CARD).exists()), None)
+    if folder is None:
         raise UserError(
             f"unknown agent {str(name)!r}: it is no folder with {CARD}, as `agents export` and `hub pull` write, and "
-            f"the package ships {', '.join(index) or 'none'}"
+            f"the package ships {', '.join(shipped()) or 'none'}"
         )
     card = read_json(folder / CARD)
     if not {"task", "corruption"} <= card.keys() or card.get("sha256") != checksums(folder):
         raise UserError(f"{folder}: its files are not those that {CARD} tells of; take another copy")
-    return Agent(load_encoder(folder / "encoder", card["task"])[0], load_policy(folder / "policy"), card)
+    return folder, card
+
+
+def shipped() -> list[str]:
+    """Names of the agents that ship."""
+    return sorted(card.parent.relative_to(SHIPPED).as_posix() for card in SHIPPED.rglob(CARD))
 
 
 def checksums(folder: Path) -> dict[str, str]:

@@ -30,6 +30,7 @@ COMMANDS = {
     "data check": ("data.check", "validate a set and replay its actions"),
     "data parity": ("data.parity", "compare rendered pixels with the data's"),
     "agents export": ("hub.export", "a fine-tuned run's encoder and policy as one small folder"),
+    "agents play": ("hub.play", "the same episodes by several agents: returns, and a film side by side"),
     "hub push": ("hub.push", "write an encoder, an agent or a data set to the Hugging Face Hub"),
     "hub pull": ("hub.pull", "fetch and check what was pushed"),
     "pretrain": ("stages.pretrain", "train an encoder"),

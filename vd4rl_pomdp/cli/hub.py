@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import tyro
 
 from vd4rl_pomdp import hub
 from vd4rl_pomdp.cli.parsing import command
+from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.runs.files import write_bytes
+from vd4rl_pomdp.runs.outputs import refuse_inside
 
 
 @command
@@ -60,3 +64,39 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
         returns = [row["return"] for row in card["episodes"] if row["evaluated_under"] == under]
         print(f"{len(returns)} episodes under {under}: mean return {sum(returns) / len(returns):.4f}")
     print(f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")')
+
+
+@command
+def play(
+    agents: tyro.conf.Positional[list[str]], episodes: int = 10, film: Path | None = None, workers: int = 0
+) -> None:
+    """Let agents of one task play the same episodes, under the corruption of the first: returns, and a film.
+
+    Args:
+        agents: Names of agents that ship, or folders that `agents export` and `hub pull` wrote.
+        episodes: How many each plays; episode i starts at the same state for all.
+        film: File to write (animated WebP): the first episode of each, with what it sees.
+        workers: Processes; 0 uses every core.
+    """
+    from finetune.export import play_agents
+    from vd4rl_pomdp.report.films import side_by_side
+    from vd4rl_pomdp.report.stats import mean_interval
+
+    if film:
+        refuse_inside(film)
+        refuse_no_folder(film.parent)
+        if film.is_dir():
+            raise UserError(f"{film}: is a folder; name a file for the film")
+    cards, played = play_agents(agents, episodes, workers)
+    under = cards[0]["corruption"]["corruption"]
+    print(f"{episodes} episodes of {cards[0]['task']} under {under}: mean return [95% t interval over episodes]")
+    returns = [np.array([episode.total for episode in one])[:, None] for one in played]
+    names = [f"{card['method']}, seed {card['seed']}" for card in cards]
+    lines = list(zip(names, returns, strict=True))
+    lines += [(f"{names[0]} less {name}", returns[0] - others) for name, others in lines[1:]]
+    for name, values in lines:
+        interval = mean_interval(values)
+        print(f"  {name:<36}{values.mean():6.0f}" + (f" [{interval[0]:.0f}, {interval[1]:.0f}]" if interval else ""))
+    if film:
+        write_bytes(film, side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
+        print(f"film: {film}")

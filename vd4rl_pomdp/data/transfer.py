@@ -20,6 +20,7 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
+from vd4rl_pomdp.data.folder import PLAN
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
 from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.data.formats.base import SourceSet
@@ -65,6 +66,8 @@ def import_set(
     refuse_inside(out)
     with _telling(source):
         opened = _resized(FORMATS.named(name).read(source, picture), size)
+        if not opened.episodes:
+            raise UserError("holds no episodes")
     own = next((value for value in opened.record.values() if isinstance(value, str)), name)
     # the name of what nothing tells a task of; of files, too
     label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
@@ -87,7 +90,13 @@ def import_set(
         for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
-    collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
+    with _without_a_trace(out):
+        try:
+            collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
+        except UserError:
+            if episodes.asked and not any(shard.path.exists() for shard in shards):
+                (out / PLAN).unlink(missing_ok=True)
+            raise
     _tell(episodes.notes())
     from vd4rl_pomdp.data.card import write_card  # draws
 
@@ -119,20 +128,29 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
             yield rows
             progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
+    # its lock keeps the hidden folder of another process from being removed
+    with _without_a_trace(hidden), disk_errors(out), owned(hidden), progress:
+        shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was killed
+        try:
+            lost = form.write(hidden / "set", out, replace(opened, read=read))
+            if out.is_dir():
+                out.rmdir()
+            (hidden / "set").rename(out)
+        finally:
+            shutil.rmtree(hidden / "set", ignore_errors=True)
+    _tell(lost)
+
+
+@contextmanager
+def _without_a_trace(folder: Path) -> Iterator[None]:
+    """In the end a folder, and those above it that were made within, are removed if they are empty."""
+    made = [folder, *(place for place in folder.parents if not place.exists())]
     try:
-        with disk_errors(out), owned(hidden), progress:
-            shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was killed
-            try:
-                lost = form.write(hidden / "set", out, replace(opened, read=read))
-                if out.is_dir():
-                    out.rmdir()
-                (hidden / "set").rename(out)
-            finally:
-                shutil.rmtree(hidden / "set", ignore_errors=True)
+        yield
     finally:
         with suppress(OSError):
-            hidden.rmdir()  # not another process's, which holds its lock
-    _tell(lost)
+            for place in made:
+                place.rmdir()
 
 
 @contextmanager
@@ -158,16 +176,23 @@ class _Reader:
         self._layout: dict[str, tuple[int, ...]] = {}
         self._last = np.zeros(0, np.uint8)  # the last picture of the episode before
         self._clipped = self._read = self._still = self._joined = 0
+        self.asked = False
 
     def __call__(self, number: int) -> EpisodeArrays:
+        self.asked = True
         with _telling(f"{self._name}: episode {number}"):
             if number != self._next:
                 self._episodes = self._source.read(number)
             rows = next(self._episodes, None)
             if rows is None:
                 raise UserError("is missing")
+            frames, told = rows[FRAMES_KEY], self._source.frame_shape
+            if len(frames) < 2:
+                raise UserError("has no step: leave it out of the source")
             rows = rows | {"action": self._scaled(rows["action"])}
-            frames = rows[FRAMES_KEY]
+            if frames.shape[2:] != told:
+                here, there = (f"{height}x{width}" for height, width in (frames.shape[2:], told))
+                raise UserError(f"has pictures of {here} pixels, its set tells of {there}")
             layout = {key: values.shape[1:] for key, values in rows.items()}
             if frames.dtype != np.uint8 or layout != (self._layout or layout):
                 raise UserError(f"has {frames.dtype} pictures and rows of {layout}, not those of the episodes before")
@@ -175,7 +200,7 @@ class _Reader:
             told = {key: values for key, values in rows.items() if key != FRAMES_KEY}
             check_rows(f"{self._name}: episode {number}", told, len(frames))
             self._read += 1
-            self._still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
+            self._still += np.array_equal(frames[1], frames[0]) and bool((frames[1:] == frames[0]).all())
             self._joined += number == self._next and np.array_equal(frames[0], self._last)
             self._next, self._last = number + 1, frames[-1]
             return rows
@@ -225,9 +250,8 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
 
     def read(first: int) -> Iterator[EpisodeArrays]:
         for rows in source.read(first):
-            pictures = rows[FRAMES_KEY].transpose(0, 2, 3, 1)
-            small = np.stack([area_means(np.ascontiguousarray(one), size) for one in pictures])
-            yield rows | {FRAMES_KEY: small.transpose(0, 3, 1, 2)}
+            small = [area_means(one.transpose(1, 2, 0), size).transpose(2, 0, 1) for one in rows[FRAMES_KEY]]
+            yield rows | {FRAMES_KEY: np.stack(small)}
 
     stretched = "" if height == width else "; height and width are scaled apart"
     note = f"pictures of {height}x{width} pixels become {size}x{size} (area means{stretched})"

@@ -37,14 +37,15 @@ def area_means(picture: np.ndarray, size: int) -> np.ndarray:
 
     Where both ratios are whole this is Pillow's box filter, which rounds after each axis. At others that filter takes
     old pixels whole or not at all, and torch's `area` lets areas overlap; so means are computed here, without an error:
-    all sums are integers below 2^24, or 2^53 along the second axis.
+    all sums are integers below 2^24, or 2^53 along the second axis of pictures of more than 128x128 pixels.
     """
     height, width, _ = picture.shape
     if not (height % size or width % size):
         return np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
-    lines = _overlaps(height, size) @ picture.reshape(height, -1).astype(np.float32)
-    sums = _overlaps(width, size).astype(np.float64) @ lines.reshape(size, width, 3)
-    return np.floor(sums / (height * width) + 0.5).astype(np.uint8)
+    exact = np.float32 if height * width <= 2**14 else np.float64  # a half is told from its neighbours, too
+    lines = _overlaps(height, size) @ picture.transpose(2, 0, 1).astype(np.float32, "C")
+    sums = lines.astype(exact) @ _overlaps(width, size).T.astype(exact)
+    return np.floor(sums / (height * width) + 0.5).astype(np.uint8).transpose(1, 2, 0)
 
 
 class GymnasiumEnv(PixelEnv):

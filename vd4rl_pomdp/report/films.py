@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 import io
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.reading import read_bytes
@@ -98,3 +98,35 @@ def movie(film: Film) -> bytes:
     buffer = io.BytesIO()
     frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=60)
     return buffer.getvalue()
+
+
+def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
+    """Animated WebP of several agents in one episode, a row for each: the scene, then the stack that the agent sees.
+
+    Args:
+        names: what to write above the rows.
+        films: one a row; stacks are shown oldest frame first, and an episode that ended early stands still.
+    """
+    frames = [
+        np.concatenate(
+            [_row(name, film, min(shot, len(film["clean"]) - 1)) for name, film in zip(names, films, strict=True)]
+        )
+        for shot in range(max(len(film["clean"]) for film in films))
+    ]
+    buffer = io.BytesIO()
+    first, *rest = map(Image.fromarray, frames)
+    first.save(buffer, "WEBP", save_all=True, append_images=rest, duration=80, loop=0, quality=70)
+    return buffer.getvalue()
+
+
+def _row(name: str, film: Film, shot: int) -> np.ndarray:
+    """One agent at one moment, (H, W, 3) uint8."""
+    stack = film["corrupted"][shot]
+    pictures = np.stack([film["clean"][shot], *stack.reshape(-1, 3, *stack.shape[1:])]).transpose(0, 2, 3, 1)
+    large = pictures.repeat(2, axis=1).repeat(2, axis=2)
+    framed = np.pad(large, ((0, 0), (22, 4), (2, 2), (0, 0)), constant_values=255)
+    image = Image.fromarray(np.concatenate([*framed], axis=1))
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
+    draw.text((4, 2), f"{name}: return {film['return'][shot]:.0f}", fill="black", font=font)
+    draw.text((framed.shape[2] + 4, 2), "what it sees: frames of the stack, oldest first", fill="gray", font=font)
+    return np.asarray(image)

@@ -14,6 +14,8 @@ from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.reading import read_bytes, regular
 from vd4rl_pomdp.runs.files import Row, appending, write_csv
 
+EVALUATION_SEED = 20_000
+"""Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
 _WHOLE = ("seed", "step", "episode", "episode_seed", "length")
 COLUMNS = (
     *(*LABELS, "step", "episode", "episode_seed", "return", "length", "score"),

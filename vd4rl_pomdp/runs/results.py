@@ -25,7 +25,7 @@ from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates, read_certificates
 from vd4rl_pomdp.runs.critic import TOLD, VALUE
-from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS, EVALUATION_SEED, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
@@ -400,8 +400,8 @@ def _kept(out: Path) -> dict[str, Result]:
 def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
     """The runs of a results folder, and a sentence for each thing in them that their own records contradict.
 
-    An id is computed anew from settings, seed, data and format as the row records them; its episodes must be of the
-    run that it names, each once, and their scores what their returns make them.
+    An id is computed anew from settings, seed, data and format as the row records them. Its episodes must be those that
+    its settings ask for, each once, under its labels; seeds and scores what numbers and returns make them.
 
     Raises:
         UserError: as `read_results`.
@@ -414,18 +414,70 @@ def _contradictions(run: Result) -> Iterator[str]:
     with whole_files(run.place):
         if (computed := _id(run)) != run.id:
             yield f"its record computes {computed}"
-        config = run.record["config"]
-        known = {"seed": config["seed"], "algorithm": config.get("algorithm"), "method": run.card.get("method")}
-        known |= {"task": run.card.get("task"), "corruption": run.card.get("corruption", {}).get("corruption")}
-        for name, value in known.items() if run.rows else ():
-            if wrong := [row[name] for row in run.rows if value is not None and row[name] != value]:
-                yield f"{len(wrong)} episodes have the {name} {wrong[0]}, its record {value}"
-        places = [(row["step"], row["evaluated_under"], row["episode"]) for row in run.rows]
-        if len(set(places)) < len(places):
-            yield f"{len(places) - len(set(places))} episodes stand there twice"
-        divisor = TASKS[run.labels["task"]].score_divisor if run.labels["task"] in TASKS else None
-        if wrong := [row for row in run.rows if divisor and abs(row["score"] - row["return"] / divisor) > _ROUNDING]:
-            yield f"{len(wrong)} scores are not their returns / {divisor:g}"
+        config, card = run.record["config"], run.encoder
+        trained = {name: value for name, value in card.items() if name != "seed"} | card.get("corruption", {})
+        known = {name: value for name, value in ((trained if run.card else {}) | config).items() if name in LABELS}
+        for name, value in known.items():
+            told = [(run.labels, "its labels have"), *((row, "an episode has") for row in run.rows)]
+            wrong = [(row[name], whose) for row, whose in told if value is not None and row[name] != value]
+            if wrong:
+                yield f"{wrong[0][1]} the {name} {wrong[0][0]}, its record {value} ({len(wrong)} such)"
+        # steps: an earlier state of a longer training is an encoder, too
+        for name in sorted(trained.keys() & card.get("settings", {}).keys() - {"steps", "corruption"}):
+            if trained[name] != card["settings"][name]:
+                yield f"its encoder says {name} {trained[name]}, its settings {card['settings'][name]}"
+        data, mean = run.files.get("critic", {}).get("data"), run.files.get("reference", {}).get("mean_reward")
+        gamma = config.get("gamma", 1)
+        if None not in (data, mean) and gamma < 1 and abs(data - mean / (1 - gamma)) > _ROUNDING:
+            yield f"its critic tells of data worth {data}, their mean reward {mean} makes {mean / (1 - gamma):.4f}"
+        if run.rows:
+            yield from _astray(run)
+
+
+def _astray(run: Result) -> Iterator[str]:
+    """What is wrong with a run's episodes: which of them are there, and what each says of itself."""
+    config, own = run.record["config"], run.labels["corruption"]
+    played: dict[tuple[int, str], list[int]] = {}
+    for row in run.rows:
+        played.setdefault((row["step"], row["evaluated_under"]), []).append(row["episode"])
+    # at the end `evaluate --keep` adds episodes under others, as many as one likes
+    wanted = {place: len(numbers) for place, numbers in played.items()}
+    if {"updates", "eval_every", "eval_episodes"} <= config.keys():  # which earlier runs do not tell
+        last, count, every = config["updates"], config["eval_episodes"], config["eval_every"]
+        ended = {run.step, run.files["timing"].get("updates")} if run.finished else {last}
+        if ended != {last}:
+            yield f"it ends with update {(ended - {last}).pop()}, its record with {last}"
+        # one that has no end may have been cut in its newest evaluation
+        end = last if run.finished else (run.diverged or {"step": run.step})["step"] - 1
+        wanted |= {
+            (step, under): 0
+            for step, under in played
+            if (run.finished or step <= end) and (step != last or under == own)
+        }
+        wanted |= {(step, own): count for step in {*range(every, end + 1, every), *[last] * run.finished}}
+        if run.finished and config.get("eval_clean") and own != "none":
+            wanted[last, "none"] = config.get("eval_clean_episodes") or count
+    for (step, under), count in sorted(wanted.items()):
+        numbers = sorted(played.get((step, under), []))
+        if len(numbers) != count or numbers != list(range(len(numbers))):
+            yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
+    task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})
+    longest = min(config.get("eval_length", math.inf), task.decisions if task else math.inf)
+    divisor = task.score_divisor if task else math.nan
+    known = reference.get("actor") is not None if "mean_reward" in reference else None  # earlier runs do not tell
+    wrong = {
+        "environment seeds are not those of their numbers": lambda row: (
+            row["episode_seed"] - row["episode"] - EVALUATION_SEED
+        ),
+        f"lengths are not within 1 and {longest}": lambda row: not 1 <= row["length"] <= longest,
+        f"scores are not their returns / {divisor:g}": lambda row: (
+            abs(row["score"] - row["return"] / divisor) > _ROUNDING
+        ),
+        "action errors lack, or tell of no actor": lambda row: (row["action_error"] is None) is known,
+    }
+    for what, of in wrong.items():
+        if count := sum(map(bool, map(of, run.rows))):
+            yield f"{count} {what}"
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:

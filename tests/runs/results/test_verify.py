@@ -51,24 +51,83 @@ def test_an_id_is_computed_anew_from_every_part_of_the_record_that_decides_a_num
     assert second.id not in told
 
 
+def edited(results: Path, row: int, **cells: str) -> None:
+    """Write into a row of episodes.csv."""
+    path = results / "episodes.csv"
+    head, *rows = [line.split(",") for line in path.read_text().splitlines()]
+    for name, value in cells.items():
+        rows[row][head.index(name)] = value
+    path.write_text("".join(",".join(line) + "\n" for line in [head, *rows]))
+
+
 def test_episodes_are_of_the_run_that_they_name_each_once_and_scored_by_their_returns(results, capsys):
-    path, (first, _) = results / "episodes.csv", read_results(results)
-    head, *rows = path.read_text().splitlines()
-    mine = rows[0].split(",")
-    assert (mine[0], mine[7]) == (first.id, "5"), "its step"
-    mine[6], mine[7], mine[12] = "7", "10", "99.0"  # seed, the other row's step, score
-    path.write_text("\n".join([head, ",".join(mine), *rows[1:]]) + "\n")
+    first, _ = read_results(results)
+    edited(results, 0, seed="7", step="10", score="99.0")  # the other row's step
     with pytest.raises(SystemExit) as ended:
         main(["results", "verify", str(results)])
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert out.splitlines() == [
-        f"run {first.id}: 1 episodes have the seed 7, its record 0",
-        f"run {first.id}: 1 episodes stand there twice",
+        f"run {first.id}: an episode has the seed 7, its record 0 (1 such)",
+        f"run {first.id}: at step 10 under patch it has the episodes [0, 0], its record 2, from 0 on",
         f"run {first.id}: 1 scores are not their returns / 10",
         "2 runs, 3 contradictions between rows and records",
     ]
     assert err == f"error: {results}: 3 contradictions, see above; ask who made the rows\n"
+
+
+OWN = "patch+zero_frames"
+EDITED_ROWS = [
+    (0, {"episode": "5"}, f"at step 20 under {OWN} it has the episodes [1, 5], its record 2, from 0 on"),
+    (1, {"step": "30"}, f"at step 20 under {OWN} it has the episodes [0], its record 2, from 0 on"),
+    (2, {"step": "60"}, f"at step 60 under {OWN} it has the episodes [0], its record 0, from 0 on"),
+    (3, {"evaluated_under": "none"}, f"at step 40 under {OWN} it has the episodes [0], its record 2, from 0 on"),
+    (4, {"evaluated_under": "glitch"}, "at step 40 under none it has the episodes [], its record 1, from 0 on"),
+    (0, {"episode_seed": "20007"}, "1 environment seeds are not those of their numbers"),
+    (0, {"length": "5"}, "1 lengths are not within 1 and 4"),
+    (0, {"quality": "medium"}, "an episode has the quality medium, its record expert (1 such)"),
+    (0, {"corruption": "none"}, "an episode has the corruption none, its record patch+zero_frames (1 such)"),
+    (0, {"action_error": "0.1"}, "1 action errors lack, or tell of no actor"),
+    (0, {"score": "0.9"}, "1 scores are not their returns / 10"),
+]
+EDITED_RECORDS = [
+    (("labels", "quality"), "medium", "its labels have the quality medium, its record expert (1 such)"),
+    (("step",), 39, "it ends with update 39, its record with 40"),
+    (("timing", "updates"), 50, "it ends with update 50, its record with 40"),
+    (
+        ("config", "config", "eval_episodes"),
+        3,
+        f"at step 20 under {OWN} it has the episodes [0, 1], its record 3, from 0 on",
+    ),
+    (("encoder", "pretrain", "corruption", "patch_size"), 24, "its encoder says patch_size 24, its settings 16"),
+    (("critic", "data"), 1.0, "its critic tells of data worth 1.0, their mean reward"),
+    (("reference", "mean_reward"), 1.0, "their mean reward 1.0 makes 100.0000"),
+]
+
+
+def test_what_was_edited_by_hand_is_found(data, encoder, tmp_path):
+    # two episodes after 20 updates and after 40, then one under no corruption
+    settings = {"eval_length": 4, "eval_episodes": 2, "eval_clean_episodes": 1}
+    results = tmp_path / "results"
+    add_results([finetune(smoke_finetune(encoder, data, tmp_path / "run", **settings)).path], results)
+    assert verify_results(results)[1] == []
+    whole = {path: path.read_text() for path in results.glob("*.*")}
+    for row, cells, said in EDITED_ROWS:
+        edited(results, row, **cells)
+        told = verify_results(results)[1]
+        assert [one for one in told if one.endswith(f": {said}")], (cells, told)
+        (results / "episodes.csv").write_text(whole[results / "episodes.csv"])
+    for place, value, said in EDITED_RECORDS:
+
+        def edit(told: dict[str, Any], place: tuple[str, ...] = place, value: Any = value) -> None:
+            for name in place[:-1]:
+                told = told[name]
+            assert told[place[-1]] != value
+            told[place[-1]] = value
+
+        told = changed(results, edit)
+        assert [one for one in told if said in one], (place, told)
+        (results / "runs.jsonl").write_text(whole[results / "runs.jsonl"])
 
 
 def test_an_episode_is_replayed_to_the_digit_and_a_difference_names_what_drew_and_computed(

@@ -72,23 +72,20 @@ def rows_of(
         physics: (T + 1, P) simulator states.
     """
     steps = len(action)
-    if len(frames) != steps + 1 or len(reward) != steps:
-        raise UserError(
-            f"has {len(frames)} pictures, {steps} actions and {len(reward)} rewards, expected one picture more"
-        )
-    discount, step_type = np.ones(steps + 1), np.full(steps + 1, StepType.MID, np.int64)
+    ended = terminated if isinstance(terminated, np.ndarray) else terminated & (np.arange(1, steps + 1) == steps)
+    counts = {"pictures": len(frames) - 1, "rewards": len(reward), "terminations": len(ended)}
+    for name, count in (counts | ({} if physics is None else {"states": len(physics) - 1})).items():
+        if count != steps:
+            raise UserError(f"has {steps} actions, but {name} for {count}")
+    step_type = np.full(steps + 1, StepType.MID, np.int64)
     step_type[0] = StepType.FIRST
     if complete and steps:
         step_type[-1] = StepType.LAST
-    if isinstance(terminated, np.ndarray):
-        discount[1:] = 1 - terminated
-    else:
-        discount[steps:] = not terminated or not steps
     return {
         "observation": frames,
         "action": np.concatenate([np.zeros_like(action[:1], shape=(1, *action.shape[1:])), action]),
         "reward": np.concatenate([[0.0], reward]),
-        "discount": discount,
+        "discount": np.append(1.0, 1.0 - ended),
         "step_type": step_type,
         **({} if physics is None else {"physics": physics}),
     }

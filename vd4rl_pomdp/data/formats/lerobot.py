@@ -24,6 +24,7 @@ import numpy as np
 from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import fits
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import FRAMES_KEY
 from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, chosen, library, rows_of
@@ -31,90 +32,100 @@ from vd4rl_pomdp.data.shards import EpisodeArrays
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 _EXTRA = "lerobot"
-_PICTURE, _OWN = "observation.image", "next.discount"
+_PICTURE, _OWN, _NO_TASK = "observation.image", "next.discount", "unknown"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _CHUNK = 1000
 """Files in a folder; a data file has about `_FILE_MB`: LeRobot's own defaults."""
 _FILE_MB = 100
 _FPS = 20
-_CODEC = {"crf": "18", "preset": "veryfast", "g": "2", "bf": "0"}
-"""H.264 in which every second frame stands alone, as in LeRobot's own videos, for access in any order."""
+_CODEC = {"crf": "18", "preset": "veryfast", "tune": "zerolatency", "threads": "1", "g": "2", "bf": "0"}
+"""H.264 in which every second frame stands alone, as in LeRobot's own videos, for access in any order; looking ahead
+and dividing such small pictures among threads would cost half as much again, for the same size."""
+_arrow, _parquet = partial(library, "pyarrow", _EXTRA), partial(library, "pyarrow.parquet", _EXTRA)
 
 
 def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
     """A set on disk, of which no more than an episode and a row group of a file is held."""
-    folder = Path(path)
-    if not (folder / "meta" / "info.json").is_file():
-        raise UserError(
-            "has no meta/info.json, so it is no LeRobot set on this disk; `hf download --repo-type dataset NAME "
-            "--local-dir FOLDER` fetches one"
-        )
-    arrow, pq = library("pyarrow", _EXTRA), library("pyarrow.parquet", _EXTRA)
-    info = read_json(folder / "meta" / "info.json")
-    if not str(info["codebase_version"]).startswith("v3."):
-        raise UserError(
-            f"is in the format {info['codebase_version']}, not v3; convert_dataset_v21_to_v30 of LeRobot converts it"
-        )
-    features = info["features"]
+    folder, pq = Path(path), _parquet()
+    info = _info(folder)
+    features, episodes = info["features"], _episodes(pq, folder, info)
     cameras = {name: tuple(one["shape"]) for name, one in features.items() if one["dtype"] in ("image", "video")}
     key, shape = chosen(cameras, picture)
-    video, own = features[key]["dtype"] == "video", _OWN in features
-    index = sorted(folder.glob("meta/episodes/*/*.parquet"))
-    names = [name for name in pq.read_schema(index[0]).names if not name.startswith("stats/")]
-    table = arrow.concat_tables([pq.read_table(file, columns=names) for file in index])
-    if len(table) != info["total_episodes"]:
-        raise UserError(f"meta/episodes has {len(table)} of {info['total_episodes']} episodes; fetch it again")
-    episodes = table.sort_by("episode_index").to_pydict()
+    own, lengths = _OWN in features, episodes["length"]
 
     def files(kind: str, template: str) -> list[Path]:
         numbers = zip(episodes[f"{kind}/chunk_index"], episodes[f"{kind}/file_index"], strict=True)
         return [folder / template.format(chunk_index=c, file_index=f, video_key=key) for c, f in numbers]
 
-    data, lengths = files("data", info["data_path"]), episodes["length"]
-    films = files(f"videos/{key}", info["video_path"]) if video else []
-    size = sum(file.stat().st_size for file in {*data, *films})
+    data, filmed = files("data", info["data_path"]), features[key]["dtype"] == "video"
+    films = files(f"videos/{key}", info["video_path"]) if filmed else []
     wanted = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
-    columns = ["episode_index", "timestamp", "action", *wanted, *([] if video else [key])]
     low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), wanted)
     tasks = [str(one) for one in pq.read_table(folder / "meta" / "tasks.parquet").to_pandas().index]
-    named = len(tasks) == 1 and re.fullmatch(r"[\w.-]+", tasks[0])
-    if len(tasks) == 1 and not named:
-        notes.append(f"its task is {tasks[0]!r}")
+    named = tasks[0] if len(tasks) == 1 and re.fullmatch(r"[\w.-]+", tasks[0]) else None
+    notes += [f"its task is {one!r}" for one in tasks if len(tasks) == 1 and not named]
 
     def read(first: int) -> Iterator[EpisodeArrays]:
-        for path, numbers in groupby(range(data.index(data[first]), len(data)), data.__getitem__):
-            with pq.ParquetFile(path) as file:
-                batches = file.iter_batches(256, columns=columns)
-                held = file.schema_arrow.empty_table().select(columns)
-                for number in numbers:
-                    while len(held) < lengths[number] and (batch := next(batches, None)):
-                        held = arrow.concat_tables([held, arrow.Table.from_batches([batch])])
-                    table, held = held.slice(0, lengths[number]), held.slice(lengths[number])
-                    if number < first:
-                        continue
-                    told = {name: _dense(table[name].combine_chunks()) for name in columns}
-                    if len(table) < lengths[number] or (told["episode_index"] != number).any():
-                        raise UserError(f"{path.name} has not the rows of it that meta/episodes tells; fetch it again")
-                    if video:
-                        times = episodes[f"videos/{key}/from_timestamp"][number] + told["timestamp"].astype(float)
-                        frames = _filmed(films[number], times, info["fps"])
-                    else:
-                        frames = np.stack([_decoded(one) for one in told[key]])
-                    yield _rows(told, frames.transpose(0, 3, 1, 2), own)
+        columns = ["episode_index", "timestamp", "action", *wanted, *([] if filmed else [key])]
+        for number, told in _stored(data, lengths, columns, first):
+            if filmed:
+                times = episodes[f"videos/{key}/from_timestamp"][number] + told["timestamp"].astype(float)
+            frames = _filmed(films[number], times, info["fps"]) if filmed else _decoded(told[key])
+            yield _rows(told, frames, own)
 
-    return SourceSet(
-        len(lengths),
-        sum(lengths),
-        shape,
-        read,
-        {"set": folder.resolve().name, "picture": key, "bytes": size},
-        low,
-        high,
-        task=tasks[0] if named else None,
-        quality=(features[_OWN].get("info") or {}).get("quality") if own else None,
-        notes=notes,
-    )
+    size = sum(file.stat().st_size for file in {*data, *films})
+    record = {"set": folder.resolve().name, "picture": key, "bytes": size}
+    quality = (features[_OWN].get("info") or {}).get("quality") if own else None
+    return SourceSet(len(lengths), sum(lengths), shape, read, record, low, high, named, quality, notes)
+
+
+def _info(folder: Path) -> dict[str, Any]:
+    """What meta/info.json tells."""
+    path = folder / "meta" / "info.json"
+    if not path.is_file():
+        fetch = "`hf download --repo-type dataset NAME --local-dir FOLDER` fetches one"
+        raise UserError(f"has no meta/info.json, so it is no LeRobot set on this disk; {fetch}")
+    info = read_json(path)
+    if not (version := str(info.get("codebase_version"))).startswith("v3."):
+        raise UserError(f"is in the format {version}, not v3; convert_dataset_v21_to_v30 of LeRobot converts it")
+    kinds = {"features": dict, "fps": float, "total_episodes": int, "total_frames": int, "data_path": str}
+    wrong = [name for name, kind in kinds.items() if not (info.get(name) and fits(info[name], kind))]
+    if wrong := wrong or [name for name, one in info["features"].items() if not {"dtype", "shape"} <= {*one}]:
+        raise UserError(f"{path}: its {wrong[0]} is missing or damaged; fetch it again")
+    return info
+
+
+def _episodes(pq: Any, folder: Path, info: dict[str, Any]) -> dict[str, list[Any]]:
+    """Columns of meta/episodes: where each episode lies, in order."""
+    index = sorted(folder.glob("meta/episodes/*/*.parquet"))
+    names = [name for file in index[:1] for name in pq.read_schema(file).names if not name.startswith("stats/")]
+    tables = [pq.read_table(file, columns=names) for file in index]
+    table = _arrow().concat_tables(tables).sort_by("episode_index").to_pydict() if index else {"length": []}
+    for what, found in (("episodes", len(table["length"])), ("frames", sum(table["length"]))):
+        if found != (told := info[f"total_{what}"]):
+            raise UserError(f"meta/episodes has {found} of {told} {what}; fetch it again")
+    return table
+
+
+def _stored(
+    data: list[Path], lengths: list[int], columns: list[str], first: int
+) -> Iterator[tuple[int, EpisodeArrays]]:
+    """Numbers of the episodes from one on, and their columns; `data` and `lengths` tell each one's file and rows."""
+    for path, numbers in groupby(range(data.index(data[first]), len(data)), data.__getitem__):
+        with _parquet().ParquetFile(path) as file:
+            batches = file.iter_batches(256, columns=columns)
+            held = file.schema_arrow.empty_table().select(columns)
+            for number in numbers:
+                while len(held) < lengths[number] and (batch := next(batches, None)):
+                    held = _arrow().concat_tables([held, _arrow().Table.from_batches([batch])])
+                table, held = held.slice(0, lengths[number]), held.slice(lengths[number])
+                if number < first:
+                    continue
+                told = {name: _dense(table[name].combine_chunks()) for name in columns}
+                if len(table) < lengths[number] or (told["episode_index"] != number).any():
+                    raise UserError(f"{path.name} has not the rows of it that meta/episodes tells; fetch it again")
+                yield number, told
 
 
 def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
@@ -155,14 +166,22 @@ def _dense(column: Any) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
-def _decoded(picture: bytes | None) -> np.ndarray:
-    if picture is None:
+def _decoded(pictures: np.ndarray) -> np.ndarray:
+    """(T, 3, H, W) uint8 of (T,) files."""
+    if None in pictures:
         raise UserError("its pictures lie in other files than data/, which are not followed")
-    return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
+    opened = (Image.open(io.BytesIO(one)) for one in pictures)
+    return _stacked([np.asarray(one if one.mode == "RGB" else one.convert("RGB")) for one in opened])
+
+
+def _stacked(pictures: list[np.ndarray]) -> np.ndarray:
+    """(H, W, 3) pictures as (T, 3, H, W), copied once: transposed after stacking they would be copied twice later."""
+    out = np.empty((len(pictures), 3, *pictures[0].shape[:2]), np.uint8)
+    return np.stack([one.transpose(2, 0, 1) for one in pictures], out=out)
 
 
 def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
-    """(T, H, W, 3) uint8 pictures of a video at increasing times, in seconds of the file."""
+    """(T, 3, H, W) uint8 pictures of a video at increasing times, in seconds of the file."""
     av = library("av", _EXTRA)
     # One for all frames: `frame.to_ndarray(format=...)` makes a new one each time, which is four times as slow.
     converter = av.video.reformatter.VideoReformatter()
@@ -177,7 +196,7 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
                 if frame.time > times[len(pictures)] - 0.5 / fps:
                     pictures.append(converter.reformat(frame, format="rgb24").to_ndarray())
                 if len(pictures) == len(times):
-                    return np.stack(pictures)
+                    return _stacked(pictures)
     except av.error.InvalidDataError as error:
         raise UserError(f"{path.name} is damaged or no video; fetch it again") from error
     raise UserError(f"{path.name} has no picture at {times[len(pictures)]:.3f} s; fetch it again")
@@ -186,144 +205,143 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
 def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:
     """LeRobot's rows of an episode as this package's."""
     count = len(frames)
-    done, truncated = (
-        bool(told[name][-2:-1].any()) if name in told else False for name in ("next.done", "next.truncated")
-    )
-    reward, action = (
-        told.get("next.reward", np.zeros(count)).reshape(count)[:-1],
-        told["action"].reshape(count, -1)[:-1],
-    )
+    done, truncated = (name in told and bool(told[name][-2:-1].any()) for name in ("next.done", "next.truncated"))
+    reward, action = told.get("next.reward", np.zeros(count)).reshape(count)[:-1], told["action"].reshape(count, -1)
     physics = told["physics"].reshape(count, -1) if "physics" in told else None
-    rows = rows_of(frames, action, reward, done and not truncated, done or not own, physics)
+    rows = rows_of(frames, action[:-1], reward, done and not truncated, done or not own, physics)
     return rows | ({"discount": np.append(1.0, told[_OWN][:-1])} if own else {})
 
 
 def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = False) -> list[str]:
     """A set that `LeRobotDataset(NAME, root=FOLDER)` loads; pictures as PNG in the rows, or as H.264 beside them."""
-    arrow, pq = library("pyarrow", _EXTRA), library("pyarrow.parquet", _EXTRA)
-    size, task = source.frame_shape[0], source.task or "unknown"
+    size, end, files = source.frame_shape[0], 0, 0
     if video and size % 2:
         raise UserError(f"video needs an even height and width, not {size}: pass --size, or take `lerobot`")
-
-    def opened(path: Path, table: Any) -> Any:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return pq.ParquetWriter(path, table.schema)
-
-    features: dict[str, dict[str, Any]] = {
-        _PICTURE: {"dtype": "image", "shape": [size, size, 3], "names": ["height", "width", "channels"]}
-    }
-    if video:
-        coded = {"height": size, "width": size, "codec": "h264", "pix_fmt": "yuv420p", "fps": _FPS, "channels": 3}
-        info = {f"video.{name}": value for name, value in (coded | {"is_depth_map": False}).items()}
-        features[_PICTURE] |= {"dtype": "video", "info": info | {"has_audio": False}}
-    png = _png_encoder(size)
-    totals: dict[str, dict[str, np.ndarray]] = {}
-    told: list[dict[str, Any]] = []
-    data: Any = None
-    index: Any = None
-    changes: list[float] = []
-    begin, files, filled, unkept, most = 0, 0, 0, False, 0
+    png, held, told, changes = _png_encoder(size), list[Any](), list[dict[str, Any]](), list[tuple[float, int]]()
+    lost = {f"steps have no duration here: in the export they are {_FPS} a second": None}
     for number, rows in enumerate(source.read(0)):
-        count = len(rows["reward"])
-        unkept |= bool(rows["action"][0].any() or rows["reward"][0] or rows["discount"][0] != 1)
-        columns = _columns(rows) | {
-            "timestamp": (np.arange(count) / _FPS).astype(np.float32),
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, number),
-            "index": np.arange(begin, begin + count),
-            "task_index": np.zeros(count, np.int64),
-        }
-        if not totals:
-            features |= {
-                name: {"dtype": str(values.dtype), "shape": [values[0].size], "names": None}
-                for name, values in columns.items()
-            }
+        if rows["action"][0].any() or rows["reward"][0] or rows["discount"][0] != 1:
+            lost["actions, rewards and discounts in first rows, which no step led to, are not stored"] = None
         pictures = np.ascontiguousarray(rows[FRAMES_KEY].transpose(0, 2, 3, 1))
-        arrays = {name: _array(arrow, values) for name, values in columns.items()}
-        if not video:
-            parts = [arrow.array([png(one) for one in pictures], arrow.binary()), arrow.nulls(count, arrow.string())]
-            arrays[_PICTURE] = arrow.StructArray.from_arrays(parts, ["bytes", "path"])
-        table = arrow.table(arrays)
-        if data is None or filled >= _FILE_MB * 2**20:
-            if data:
-                data.close()
-            data, files, filled = opened(folder / _DATA.format(**_numbered("", files)), table), files + 1, 0
-        data.write_table(table)
-        filled += table.nbytes
-        place = _numbered("data/", files - 1) | _numbered("meta/episodes/", 0)
-        place |= {"dataset_from_index": begin, "dataset_to_index": begin + count}
+        columns, begin, end = _columns(rows, number, end), end, end + len(pictures)
+        held.append(_table(columns, [] if video else [png(one) for one in pictures]))
+        place = {"episode_index": number, "tasks": [source.task or _NO_TASK], "length": end - begin}
+        place |= {"dataset_from_index": begin, "dataset_to_index": end}
+        place |= _numbered("data/", files) | _numbered("meta/episodes/", 0)
         if video:
-            where = _numbered("", number)
-            film = folder / _VIDEO.format(video_key=_PICTURE, **where)
+            film = folder / _VIDEO.format(video_key=_PICTURE, **_numbered("", number))
             _encode(film, pictures)
             if number % 10 == 0:
-                change = np.abs(_filmed(film, np.arange(count) / _FPS, _FPS).astype(np.int16) - pictures)
-                changes.append(float(change.mean()))
-                most = max(most, int(change.max()))
-            where |= {"from_timestamp": 0.0, "to_timestamp": count / _FPS}
+                change = np.abs(
+                    _filmed(film, columns["timestamp"].astype(float), _FPS).astype(np.int16) - rows[FRAMES_KEY]
+                )
+                changes.append((change.mean(), change.max()))
+            where = _numbered("", number) | {"from_timestamp": 0.0, "to_timestamp": len(pictures) / _FPS}
             place |= {f"videos/{_PICTURE}/{name}": value for name, value in where.items()}
-        stats = {name: _stats(values) for name, values in columns.items()} | {_PICTURE: _stats(pictures[::10])}
-        totals = {name: _joined(totals[name], one) if totals else one for name, one in stats.items()}
-        place |= {f"stats/{name}/{kind}": one[kind].tolist() for name, one in stats.items() for kind in one}
-        told.append({"episode_index": number, "tasks": [task], "length": count} | place)
-        if len(told) == 100 or number == source.episodes - 1:
-            table, told = arrow.Table.from_pylist(told), []
-            index = index or opened(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", table)
-            index.write_table(table)
-        begin += count
-    for writer in (data, index):
-        writer.close()
+        for name, values in (columns | {_PICTURE: rows[FRAMES_KEY][::10]}).items():
+            place |= {f"stats/{name}/{kind}": value for kind, value in _stats(values).items()}
+        told.append(place)
+        if end == source.rows or sum(table.nbytes for table in held) >= _FILE_MB * 2**20:
+            _save(folder / _DATA.format(**_numbered("", files)), held)
+            held, files = [], files + 1
+    _save(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", [_arrow().Table.from_pylist(told)])
+    _describe(folder, source, columns, told, video)
+    if video:
+        mean, most = np.mean([one[0] for one in changes]), max(one[1] for one in changes)
+        off = f"values are off by {mean:.2f} of 255 on average, {most} at most"
+        lost[f"pictures became H.264: in every tenth episode {off}; the format `lerobot` keeps them"] = None
+    return list(lost)
+
+
+def _columns(rows: EpisodeArrays, number: int, begin: int) -> dict[str, np.ndarray]:
+    """An episode's rows by LeRobot's names: o_t with a_t and what it led to; the last row repeats the last action."""
+    frame = np.arange(len(rows["reward"]))
+    after = np.minimum(frame + 1, frame[-1])
+    return {
+        "action": rows["action"][after].astype(np.float32),
+        "next.reward": np.append(rows["reward"][1:], 0.0),
+        "next.done": (rows["step_type"] == StepType.LAST)[after],
+        _OWN: rows["discount"][after].astype(np.float64),
+        # not called `observation.*`, all of which LeRobot's policies are given
+        **{name: rows[name] for name in ("physics",) if name in rows},
+        "timestamp": (frame / _FPS).astype(np.float32),
+        "frame_index": frame,
+        "episode_index": np.full_like(frame, number),
+        "index": frame + begin,
+        "task_index": np.zeros_like(frame),
+    }
+
+
+def _table(columns: dict[str, np.ndarray], files: list[bytes]) -> Any:
+    """Rows as they are stored: a column of width 1 holds numbers, not lists of one; PNG files, if there are any."""
+    arrow = _arrow()
+    arrays = {name: arrow.array(values.ravel()) for name, values in columns.items()}
+    for name, values in columns.items():
+        if values[0].size > 1:
+            arrays[name] = arrow.FixedSizeListArray.from_arrays(arrays[name], values.shape[1])
+    if files:
+        parts = [arrow.array(files, arrow.binary()), arrow.nulls(len(files), arrow.string())]
+        arrays[_PICTURE] = arrow.StructArray.from_arrays(parts, ["bytes", "path"])
+    return arrow.table(arrays)
+
+
+def _save(path: Path, tables: list[Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _parquet().write_table(_arrow().concat_tables(tables), path, row_group_size=512)
+
+
+def _describe(folder: Path, source: SourceSet, columns: EpisodeArrays, told: list[dict[str, Any]], video: bool) -> None:
+    """What meta/ holds beside the episodes."""
+    size, task = source.frame_shape[0], source.task or _NO_TASK
+    coded = {"height": size, "width": size, "codec": "h264", "pix_fmt": "yuv420p", "fps": _FPS, "channels": 3}
+    info = {f"video.{name}": value for name, value in (coded | {"is_depth_map": False}).items()} | {"has_audio": False}
+    picture = {"shape": [size, size, 3], "names": ["height", "width", "channels"]}
+    picture |= {"dtype": "video", "info": info} if video else {"dtype": "image"}
+    features: dict[str, dict[str, Any]] = {_PICTURE: picture} | {
+        name: {"dtype": str(values.dtype), "shape": [values[0].size], "names": None} for name, values in columns.items()
+    }
     features[_OWN]["info"] = {"quality": source.quality}
     from pandas import DataFrame, Index  # slow to load
 
     DataFrame({"task_index": [0]}, index=Index([task], name="task")).to_parquet(folder / "meta" / "tasks.parquet")
-    plain = {name: {kind: value.tolist() for kind, value in one.items()} for name, one in totals.items()}
-    write_json(folder / "meta" / "stats.json", plain)
+    write_json(folder / "meta" / "stats.json", {name: _joined(told, f"stats/{name}/") for name in features})
     described = {
         "codebase_version": "v3.0",
         "robot_type": None,
-        "total_episodes": source.episodes,
-        "total_frames": begin,
+        "total_episodes": len(told),
+        "total_frames": told[-1]["dataset_to_index"],
         "total_tasks": 1,
         "chunks_size": _CHUNK,
         "data_files_size_in_mb": _FILE_MB,
         "video_files_size_in_mb": 200,
         "fps": _FPS,
-        "splits": {"train": f"0:{source.episodes}"},
+        "splits": {"train": f"0:{len(told)}"},
         "data_path": _DATA,
         "video_path": _VIDEO if video else None,
         "features": features,
     }
     write_json(folder / "meta" / "info.json", described)
-    lost = [f"steps have no duration here: in the export they are {_FPS} a second"]
-    if unkept:
-        lost.append("actions, rewards and discounts in first rows, which no step led to, are not stored")
-    if video:
-        lost.append(
-            f"pictures became H.264: in every tenth episode values are off by {np.mean(changes):.2f} of 255 on "
-            f"average, {most} at most; the format `lerobot` keeps them"
-        )
-    return lost
 
 
-def _columns(rows: EpisodeArrays) -> dict[str, np.ndarray]:
-    """An episode's rows by LeRobot's names: o_t with a_t and what it led to; the last row repeats the last action."""
-    count = len(rows["reward"])
-    after = np.minimum(np.arange(count) + 1, count - 1)
-    columns = {
-        "action": rows["action"][after].astype(np.float32),
-        "next.reward": np.append(rows["reward"][1:], 0.0),
-        "next.done": (rows["step_type"] == StepType.LAST)[after],
-        _OWN: rows["discount"][after].astype(np.float64),
-    }
-    # not called `observation.*`, all of which LeRobot's policies are given
-    return columns | ({"physics": rows["physics"]} if "physics" in rows else {})
+def _stats(values: np.ndarray) -> dict[str, list[Any]]:
+    """Statistics of a column over rows, or of the channels of (N, 3, H, W) pictures, which count from 0 to 1."""
+    pixels = values.ndim == 4
+    flat = values.swapaxes(0, 1).reshape(3, -1) if pixels else values.reshape(len(values), -1).T.astype(float)
+    told = {"min": flat.min(1), "max": flat.max(1), "mean": flat.mean(1), "std": flat.std(1)}
+    shaped = {kind: (value / 255).reshape(3, 1, 1) if pixels else value for kind, value in told.items()}
+    return {kind: value.tolist() for kind, value in shaped.items()} | {"count": [len(values)]}
 
 
-def _array(arrow: Any, values: np.ndarray) -> Any:
-    """A column of the file; of width 1 it holds numbers, not lists of one."""
-    flat = arrow.array(values.ravel())
-    return flat if values[0].size == 1 else arrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+def _joined(told: list[dict[str, Any]], prefix: str) -> dict[str, list[Any]]:
+    """Statistics of all episodes together."""
+    least, most, means, std, count = (
+        np.array([one[prefix + kind] for one in told], float) for kind in ("min", "max", "mean", "std", "count")
+    )
+    share = (count / count.sum()).reshape(-1, *[1] * (means.ndim - 1))
+    mean = (share * means).sum(0)
+    spread = np.sqrt((share * (std**2 + (means - mean) ** 2)).sum(0))
+    whole = {"min": least.min(0), "max": most.max(0), "mean": mean, "std": spread}
+    return {kind: value.tolist() for kind, value in whole.items()} | {"count": [int(count.sum())]}
 
 
 def _png_encoder(size: int) -> Callable[[np.ndarray], bytes]:
@@ -350,24 +368,6 @@ def _encode(path: Path, pictures: np.ndarray) -> None:
 
 def _numbered(prefix: str, number: int) -> dict[str, Any]:
     return {f"{prefix}chunk_index": number // _CHUNK, f"{prefix}file_index": number % _CHUNK}
-
-
-def _stats(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Statistics of a column over rows, or of the channels of (N, H, W, 3) pictures, which count from 0 to 1."""
-    pixels = values.ndim == 4
-    flat = values.reshape(-1, 3) / 255 if pixels else values.reshape(len(values), -1).astype(float)
-    told = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
-    shaped = {kind: value.reshape((3, 1, 1) if pixels else -1) for kind, value in told.items()}
-    return shaped | {"count": np.array([len(values)])}
-
-
-def _joined(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Statistics of two parts together."""
-    count = a["count"] + b["count"]
-    mean = (a["count"] * a["mean"] + b["count"] * b["mean"]) / count
-    squares = sum(one["count"] * (one["std"] ** 2 + (one["mean"] - mean) ** 2) for one in (a, b))
-    least, most = np.minimum(a["min"], b["min"]), np.maximum(a["max"], b["max"])
-    return {"min": least, "max": most, "mean": mean, "std": np.sqrt(squares / count), "count": count}
 
 
 LEROBOT = DataFormat("LeRobot's sets, version 3; written with PNG pictures", read_lerobot, write_lerobot)

@@ -59,14 +59,15 @@ def read(source: str, picture: str | None) -> SourceSet:
         frames = stored.observations
         for part in key.split("/") if key else ():
             frames = frames[int(part) if isinstance(frames, tuple) else part]
-        action = stored.actions
+        if len(action := stored.actions) != len(stored.truncations):
+            raise UserError(f"has {len(action)} actions, but {len(stored.truncations)} truncations")
         action = one_hot(action - actions.start, actions.n) if discrete else action.reshape(len(action), -1)
         return rows_of(
             as_frames(frames),
             action,
             stored.rewards,
             stored.terminations,
-            bool(stored.terminations[-1] or stored.truncations[-1]),
+            bool(stored.terminations[-1:].any() or stored.truncations[-1:].any()),
             stored.infos["physics"] if told.get("physics") else None,
         )
 

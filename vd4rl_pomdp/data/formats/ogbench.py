@@ -22,9 +22,7 @@ def read(source: str, picture: str | None) -> SourceSet:
     """Open a file such as visual-cube-single-play-v0.npz."""
     path = Path(source)
     with zipfile.ZipFile(path) as file:
-        if lacking := {"observations", "actions", "terminals"} - {
-            name.removesuffix(".npy") for name in file.namelist()
-        }:
+        if lacking := {"observations", "actions", "terminals"} - {Path(name).stem for name in file.namelist()}:
             raise UserError(f"has no {min(lacking)!r}, so it is no set of OGBench")
     with np.load(path) as file:  # which reads what is asked for
         action, terminals = file["actions"], file["terminals"].astype(bool)
@@ -32,6 +30,10 @@ def read(source: str, picture: str | None) -> SourceSet:
         _, size = chosen({"observations": shape[1:]} if dtype == np.uint8 else {}, picture)
     if action.dtype.kind != "f":
         raise UserError(f"has actions of {action.dtype}, expected floating point")
+    if not len(action) == len(terminals) == shape[0]:
+        raise UserError(
+            f"has {shape[0]} pictures, {len(action)} actions and {len(terminals)} terminals; fetch it again"
+        )
     ends = np.flatnonzero(terminals) + 1
     if not len(ends) or ends[-1] != len(terminals):
         raise UserError("its last episode has no end")

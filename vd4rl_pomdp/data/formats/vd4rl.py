@@ -93,9 +93,12 @@ def _episode(path: Path) -> EpisodeArrays:
     if lacking := [key for key in ("image", "action", "reward") if key not in stored]:
         raise UserError(f"{path}: has no {lacking[0]!r}, so it is no episode of V-D4RL (keys: {', '.join(stored)})")
     rows = len(stored["reward"])
+    for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
+        if (count := len(stored.get(key, stored["reward"]))) != rows:
+            raise UserError(f"{path}: {key!r} has {count} rows, 'reward' {rows}; fetch it again")
     step_type = np.full(rows, StepType.MID, np.int64)
-    step_type[-1] = StepType.LAST if stored.get("is_last", np.ones(1))[-1] else StepType.MID
-    step_type[0] = StepType.FIRST
+    step_type[-1:] = StepType.LAST if stored.get("is_last", np.ones(1))[-1:].any() else StepType.MID
+    step_type[:1] = StepType.FIRST
     return {
         FRAMES_KEY: as_frames(stored["image"]),
         "action": stored["action"],
