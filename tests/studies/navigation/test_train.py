@@ -13,8 +13,15 @@ from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import MazeData, open_data, open_maze_set
 from vd4rl_pomdp.studies.navigation.measures import METHOD_NAMES, OBJECTIVES
-from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe, refit
-from vd4rl_pomdp.studies.navigation.train import ProbedObjective, learning_rate, make_trainer, train
+from vd4rl_pomdp.studies.navigation.train import (
+    ErrorSums,
+    ProbedObjective,
+    StateProbe,
+    learning_rate,
+    make_trainer,
+    refit,
+    train,
+)
 
 
 @pytest.fixture(autouse=True)
