@@ -48,14 +48,9 @@ class EndToEnd:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on."""
-        return {
-            "algorithm": self.algorithm.state_dict(),
-            "encoder": self.encoder.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-        }
+        return {name: getattr(self, name).state_dict() for name in ("algorithm", "encoder", "optimiser")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self.algorithm.load_state_dict(state["algorithm"])
-        self.encoder.load_state_dict(state["encoder"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        for name, own in state.items():
+            getattr(self, name).load_state_dict(own)

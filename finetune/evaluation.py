@@ -19,7 +19,7 @@ from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference, action_error
-from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.policy import load_policy, policy_step
 from vd4rl_pomdp.policies.actor import read_actor
@@ -101,15 +101,6 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
     ]
 
 
-def _run_episode(job: EpisodeJob) -> Episode:
-    written = tuple(folder.stat().st_mtime_ns for folder in (job.encoder, job.policy) if folder.exists())
-    agent = _agent(job.encoder, job.policy, written)
-    # a film shows all frames; else no frame is drawn that its agent does not see
-    draws: Drawn = "all" if job.film else "nothing" if agent.encoder.reads_state else "seen"
-    place = (job.task, job.corruption, "fast", job.length, agent.picture_size, draws)
-    return _play(agent, _environment(*place), job)
-
-
 @cache
 def _environment(*place: Any) -> CorruptedEnv:
     """The process's environment for these arguments: one GL context serves all its episodes."""
@@ -125,7 +116,12 @@ def _agent(encoder: Path, policy: Path, written: tuple[int, ...]) -> Agent:
     return Agent(load_encoder(encoder)[0], load_policy(policy))
 
 
-def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
+def _run_episode(job: EpisodeJob) -> Episode:
+    written = tuple(folder.stat().st_mtime_ns for folder in (job.encoder, job.policy) if folder.exists())
+    agent = _agent(job.encoder, job.policy, written)
+    # a film shows all frames; else no frame is drawn that its agent does not see
+    draws: Drawn = "all" if job.film else "nothing" if agent.encoder.reads_state else "seen"
+    env = _environment(job.task, job.corruption, "fast", job.length, agent.picture_size, draws)
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     film = [(now, 0.0)]
@@ -140,16 +136,14 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
         rewards.append(now.time_step.reward)
         if job.film and len(rewards) % FILM_EVERY == 0:
             film.append((now, float(np.cumsum(rewards)[-1])))
-    under = job.evaluated_under or job.corruption.corruption
-    return Episode(under, job.episode, rewards, _film(film) if job.film else None, errors)
-
-
-def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
-    return {
-        "clean": np.stack([shot.clean[-3:].numpy() for shot, _ in shots]),
-        "corrupted": np.stack([shot.obs.numpy() for shot, _ in shots]),
-        "return": np.array([total for _, total in shots]),
-    }
+    pictures = None
+    if job.film:
+        pictures = {
+            "clean": np.stack([shot.clean[-3:].numpy() for shot, _ in film]),
+            "corrupted": np.stack([shot.obs.numpy() for shot, _ in film]),
+            "return": np.array([total for _, total in film]),
+        }
+    return Episode(job.evaluated_under or job.corruption.corruption, job.episode, rewards, pictures, errors)
 
 
 def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | None]]:
@@ -164,19 +158,13 @@ def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | 
     """
     longest = max(len(episode.rewards) for episode in episodes)
     parts = min(parts, longest)
-    edges = [longest * part // parts for part in range(parts + 1)]
-    return {
-        f"{first}-{end - 1}": {
-            "reward": _mean(value for episode in episodes for value in episode.rewards[first:end]),
-            "action_error": _mean(value for episode in episodes for value in episode.action_errors[first:end]),
-        }
-        for first, end in pairwise(edges)
-    }
-
-
-def _mean(values: Iterable[Any]) -> float | None:
-    found = list(values)
-    return float(np.mean(found)) if found else None
+    found: dict[str, dict[str, float | None]] = {}
+    for first, end in pairwise(longest * part // parts for part in range(parts + 1)):
+        rewards = [value for episode in episodes for value in episode.rewards[first:end]]
+        errors = [value for episode in episodes for value in episode.action_errors[first:end]]
+        error = float(np.mean(errors)) if errors else None
+        found[f"{first}-{end - 1}"] = {"reward": float(np.mean(rewards)), "action_error": error}
+    return found
 
 
 def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -267,14 +266,13 @@ class ExactSampler(Sampler):
         if not encoder.remembers:
             features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self.view)
             return features[: len(rows)], features[len(rows) :]
-        return read_both_ends(
-            encoder, partial(self._frames, key), self._frozen.dataset, self._first(rows), rows, next_rows
-        )
 
-    def _frames(self, key: Tensor, rows: Tensor) -> Tensor:
-        """Frame features (B, T, F) of (B, T) rows, those under one leading index shifted alike."""
-        keys = key.repeat_interleave(rows.shape[1])
-        return self._frozen.rows(rows.reshape(-1), keys, self.view).view(*rows.shape, -1)
+        def frames(rows: Tensor) -> Tensor:
+            """Frame features (B, T, F) of (B, T) rows, those under one leading index shifted alike."""
+            keys = key.repeat_interleave(rows.shape[1])
+            return self._frozen.rows(rows.reshape(-1), keys, self.view).view(*rows.shape, -1)
+
+        return read_both_ends(encoder, frames, self._frozen.dataset, self._first(rows), rows, next_rows)
 
     def _first(self, rows: Tensor) -> Tensor:
         """Rows at which the histories of (B,) rows begin."""

@@ -96,13 +96,9 @@ class Histories:
         """What is drawn for a view."""
         generator = stream_generator(self._seed, "finetune", "histories", view)
         chosen = torch.randperm(len(self.rows), generator=generator)[: self.random].sort().values
-        length = draw_lengths(self._options, self.random, generator)
+        shortest, longest = self._options.shortest_history, self._options.longest_history
+        length = torch.randint(shortest, longest + 1, (self.random,), generator=generator)
         return RandomHistories(self, chosen.to(self.rows.device), length.to(self.rows.device))
-
-
-def draw_lengths(options: HistoryOptions, count: int, generator: torch.Generator) -> Tensor:
-    """Rows, up to a transition's first end, of (count,) random histories."""
-    return torch.randint(options.shortest_history, options.longest_history + 1, (count,), generator=generator)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ class _Asked:
     def trainer(self) -> FinetuneTrainer:
         """What trains the run, whose folder is owned; encodes the set."""
         what = "it was pretrained; pretrain it again"
-        warn_of_other_code(self.config.encoder, self.before.code, self.before.parts, what)
+        warn_of_other_code(self.config.encoder, vars(self.before), self.before.parts, what)
         self.dataset.to(self.device)
         return make_trainer(self.config, self.dataset, self.encoder.to(self.device), self.card, self.run)
 

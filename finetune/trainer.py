@@ -8,7 +8,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,20 +20,20 @@ from finetune.end_to_end import EndToEnd
 from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
 from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
-from finetune.path import DataPath
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.streams import random_stream
-from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference
+from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, save_encoder, tell_probe
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
-from vd4rl_pomdp.policies.actor import read_actor
+from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs import (
     CRITIC_FILE,
     EPISODES_FILE,
@@ -57,18 +56,16 @@ from vd4rl_pomdp.runs.run import RunFolder
 RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
 """What a finished run holds."""
 FEATURES_FILE = "features.npy"
+PATH_EPISODES = 20
+"""Episodes that the error on the data's path is measured on, evenly spaced among those that hold a decision."""
 STANDARDISED_BY = 1024
 """Least transitions whose representations give their means and deviations, where none are kept (`--views 0`)."""
 
 
 def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
     """The columns that name a run's rows."""
-    labels = {name: getattr(card, name) for name in ("method", "task", "quality")}
-    return labels | {
-        "corruption": card.corruption["corruption"],
-        "algorithm": config.algorithm,
-        "seed": config.seed,
-    }
+    before = {"method": card.method, "task": card.task, "quality": card.quality}
+    return before | {"corruption": card.corruption["corruption"], "algorithm": config.algorithm, "seed": config.seed}
 
 
 def make_trainer(
@@ -84,14 +81,19 @@ def make_trainer(
         run: its folder, which is owned; labels, encoder and features are written there.
     """
     write_json(run.path / LABELS_FILE, labels_of(config, card))
-    _keep_encoder(config, run.path)
+    if not all((run.path / name).exists() for name in FILES_OF_RUN):
+        # copied, so that the run can be evaluated wherever it is moved; the pretraining's seconds, too
+        if (timing := config.encoder.parent / TIMING_FILE).exists():
+            write_json(run.path / PRETRAIN_TIMING_FILE, read_json(timing))
+        changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
+        copy_encoder(config.encoder, run.path / "encoder", changes)
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     draws = random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
     corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: what is hidden belongs to the world
     returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed_of_views)
-    encode = partial(frozen.episode, view=frozen.view(0))
+    encode: Callable[[int], torch.Tensor] = partial(frozen.episode, view=frozen.view(0))
     sampler: FeatureSampler | ExactSampler | TransitionSampler
     if card.end_to_end:
         view = View(dataset, corruption, config.shift, config.seed_of_views, STAGE)
@@ -101,7 +103,7 @@ def make_trainer(
         features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE, run.inputs["encoder"])
         policy.standardise.fit(features)
         _probe(features, dataset, run)
-        encode = partial(_cached, features, dataset)
+        encode = lambda number: features[0, dataset.rows_of(number)].float()  # noqa: E731, of the first view
         sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, draws)
     else:
         sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, draws)
@@ -111,33 +113,42 @@ def make_trainer(
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
     reference = Reference.of(dataset)
     actor = reference.actor_file
-    path = DataPath(dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
-    return FinetuneTrainer(
-        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm,
-        sampler,
-        config,
-        card,
-        run,
-        reference,
-        path,
-    )
+    path = partial(path_error, dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
+    trained = EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm
+    return FinetuneTrainer(trained, sampler, config, card, run, reference, path)
 
 
-def _keep_encoder(config: FinetuneConfig, run: Path) -> None:
-    """Copy the encoder into the run, so that the run can be evaluated wherever it is moved; its timing, too."""
-    source = config.encoder
-    if all((run / name).exists() for name in FILES_OF_RUN):
-        return
-    timing = source.parent / TIMING_FILE
-    if timing.exists():
-        write_json(run / PRETRAIN_TIMING_FILE, read_json(timing))
-    changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
-    copy_encoder(source, run / "encoder", changes)
+@torch.no_grad()
+def path_error(
+    dataset: Dataset,
+    actor: Actor,
+    encode: Callable[[int], torch.Tensor],
+    policy: Callable[[torch.Tensor], torch.Tensor],
+) -> float:
+    """How far a policy is from the actor that made the data, on the data's own path.
 
+    Args:
+        dataset: a set with simulator states.
+        actor: what made it.
+        encode: representations (rows, D) of the episode of a number.
+        policy: from (rows, D) to actions (rows, A).
 
-def _cached(features: torch.Tensor, dataset: Dataset, number: int) -> torch.Tensor:
-    """Representations (rows, D) of an episode in the first view."""
-    return features[0, dataset.rows_of(number)].float()
+    Returns:
+        Mean squared difference from the actor's mean action over all decisions of PATH_EPISODES episodes at most.
+    """
+    assert dataset.task is not None
+    assert dataset.physics is not None
+    task = TASKS.named(dataset.task)
+    assert isinstance(task, DMCTask), "other tasks store no states"
+    deciding = np.flatnonzero((dataset.episode_end - dataset.episode_start).cpu().numpy() > 1)
+    last = len(deciding) - 1
+    errors = []
+    for number in deciding[np.unique(np.linspace(0, last, min(last + 1, PATH_EPISODES)).astype(int))].tolist():
+        physics = dataset.physics[dataset.rows_of(number)][:-1]  # an episode's last row decides nothing
+        shown = np.array([actor.act(state) for state in observed_states(task, physics)])
+        actions = policy(encode(number)[:-1]).cpu().numpy()
+        errors.append(np.square(actions - shown.reshape(actions.shape)).mean(1))
+    return float(np.concatenate(errors).mean())
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
@@ -167,11 +178,11 @@ class FinetuneTrainer:
         card: EncoderCard,
         run: RunFolder,
         reference: Reference,
-        path: DataPath | None,
+        path_error: Callable[[Policy], float] | None,
     ) -> None:
         self.algorithm, self.sampler = algorithm, sampler
         self.config, self.card, self.folder = config, card, run
-        self.reference, self.path = reference, path
+        self.reference, self.path_error = reference, path_error
         self.step = 0
         self.settle: Callable[[], None] = lambda: None
         """Brings algorithm and sampler to the last update's state, where others make the updates."""
@@ -191,9 +202,8 @@ class FinetuneTrainer:
     def finish(self) -> None:
         """Write what a trained run ends with."""
         path = self.folder.path
-        if self.path:
-            error = self.path.action_error(self.algorithm.policy)
-            self.reference.with_path_error(error).write(path)
+        if self.path_error:
+            self.reference.with_path_error(self.path_error(self.algorithm.policy)).write(path)
         (path / FEATURES_FILE).unlink(missing_ok=True)
         write_json(path / RENDER_FILE, render_info(self.card.task))
         gamma = getattr(self.config.options, "gamma", None)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -79,7 +79,7 @@ def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
     return build_objective(config, dataset.action_dim, target, states, (3 * FRAME_STACK, dataset.frame_size))
 
 
-def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective) -> Batches:
+def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective) -> WindowSampler:
     """Windows of a set as the method is to see them, from the run's own random stream."""
     method, draws = METHODS.named(config.method), random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
     frame = objective.encoder.frame
@@ -174,29 +174,13 @@ def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCa
     )
 
 
-class Batches(Protocol):
-    """Endless batches of windows."""
-
-    draws: RandomStream
-    """What they are drawn from."""
-
-    def sample(self) -> Windows:
-        """The next batch, as the objective is to see it."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume with the same batches."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-
-
 class Trainer:
     """Knows no method by name: sample, compute the loss, step. Resumes to the bit on a CPU."""
 
     def __init__(
         self,
         objective: Objective,
-        batches: Batches,
+        batches: WindowSampler,
         config: TrainingConfig,
         learning_rate: Callable[[int], float] | None = None,
     ) -> None:

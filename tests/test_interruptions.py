@@ -35,7 +35,7 @@ from vd4rl_pomdp.studies.navigation.collect import PRESETS
 from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX
-from vd4rl_pomdp.studies.navigation.probe import COMPONENTS
+from vd4rl_pomdp.studies.navigation.train import COMPONENTS
 from vd4rl_pomdp.studies.navigation.train import train as run_navigation
 
 FINETUNE = {

@@ -26,9 +26,8 @@ _PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 def keep_policies(runs: Path, snapshots: Path) -> None:
     """Copy each policy that is not kept yet, under the update that it is of."""
     for weights in runs.rglob("policy/model.safetensors"):
-        with weights.open(
-            "rb"
-        ) as file:  # opened once: a new version takes the place of this one, and does not change it
+        # opened once: a new version takes the place of this one, and does not change it
+        with weights.open("rb") as file:
             header = file.read(int.from_bytes(file.read(8), "little"))
             step = json.loads(header)["__metadata__"]["step"]
             kept = snapshots / weights.parent.parent.relative_to(runs) / f"{step}.safetensors"

@@ -3,7 +3,7 @@
 import os
 from typing import TYPE_CHECKING
 
-from vd4rl_pomdp.core.version import __version__
+from vd4rl_pomdp.core import __version__
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.agents import load_agent

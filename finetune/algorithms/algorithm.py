@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from finetune.features import FeatureBatch
@@ -130,9 +130,9 @@ class Algorithm(ABC):
         for optimiser in optimisers:
             optimiser.step()
 
-    @abstractmethod
     def parts(self) -> dict[str, Any]:
-        """Networks, targets and optimisers by name: what has a state of its own. The target of `x` is `target_x`."""
+        """The networks, targets and optimisers among its attributes, by name. The target of `x` is `target_x`."""
+        return {name: part for name, part in vars(self).items() if isinstance(part, nn.Module | Optimizer)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to resume: the state of all parts, the updates made, the noise."""
@@ -148,3 +148,10 @@ class Algorithm(ABC):
         else:
             self.updates = state["updates"]
         self.draws.set_state(state["noise"])
+
+
+def share_of(done: int | Tensor, whole: float) -> float | Tensor:
+    """How much of a whole is done, 1 at most: a number of a number, a tensor of one."""
+    if isinstance(done, Tensor):
+        return (done.double() / whole).clamp(max=1.0)
+    return min(1.0, done / whole)

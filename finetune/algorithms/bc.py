@@ -6,7 +6,8 @@ The reference that uses no reward. The noise is that of `drqv2_bc`: noisy action
 gradient passes there as if they were not, so that a policy near a bound is pushed outwards while the noise is large: it
 is the mean of the actions cut off that comes to be the data's.
 
-Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py).
+Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py; of the noise drqbc/utils.py, `TruncatedNormal` and
+`schedule`).
 
 Differences:
 - Representations go straight into the policy, standardised where the encoder is frozen; the authors' actor begins with
@@ -16,19 +17,23 @@ Differences:
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch.nn.functional as F
 from torch import Tensor
 from torch.optim import Optimizer
 
-from finetune.algorithms.algorithm import Algorithm, Loss
-from finetune.algorithms.noise import noise_at, with_noise
+from finetune.algorithms.algorithm import Algorithm, Loss, share_of
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.adam import Adam
 from vd4rl_pomdp.nn.policy import Policy
+
+NOISE_CLIP = 0.3
+"""Largest noise on a dimension of an action."""
+NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 250_000
+"""Standard deviation at the first update, from the last of these updates on, and how many these are at most."""
+MARGIN = 1e-6
+"""How far from -1 and 1 a noisy action stays."""
 
 
 class BC(Algorithm):
@@ -55,6 +60,21 @@ class BC(Algorithm):
         loss = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"bc_loss": loss.detach()})
 
-    def parts(self) -> dict[str, Any]:
-        """The policy and its optimiser."""
-        return {"policy": self.policy, "optimiser": self.optimiser}
+
+def noise_at(update: int | Tensor, planned: int) -> float | Tensor:
+    """Standard deviation of the noise after so many updates: it falls linearly, then stays.
+
+    Args:
+        update: updates that were made, see `Algorithm.updates`.
+        planned: all that there will be; it falls over half of them where that is sooner than in V-D4RL, which makes
+            550,000: noise that has not fallen when training ends pushes the policy's actions outwards.
+    """
+    done = share_of(update, min(NOISE_UPDATES, planned / 2))
+    return NOISE_START + done * (NOISE_END - NOISE_START)
+
+
+def with_noise(action: Tensor, noise: Tensor) -> Tensor:
+    """Copy of (B, A) actions with (B, A) noise, within -1..1; the gradient passes as if nothing had been cut off."""
+    noisy = action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
+    # straight through: with the true gradient, 0 beyond the bounds, a saturated action would never come back
+    return noisy + (noisy.clamp(MARGIN - 1, 1 - MARGIN) - noisy).detach()

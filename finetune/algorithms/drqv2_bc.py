@@ -25,7 +25,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from finetune.algorithms.noise import noise_at, with_noise
+from finetune.algorithms.bc import noise_at, with_noise
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FeatureBatch
 

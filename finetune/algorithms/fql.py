@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -176,17 +176,6 @@ class FQL(Algorithm):
         with torch.no_grad():
             cloning = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"actor_loss": loss.detach(), "distillation_loss": distance.detach(), "bc_loss": cloning})
-
-    def parts(self) -> dict[str, Any]:
-        """Networks, target and optimiser."""
-        return {
-            "policy": self.policy,
-            "noise_in": self.noise_in,
-            "flow": self.flow,
-            "critic": self.critic,
-            "target_critic": self.target_critic,
-            "optimiser": self.optimiser,
-        }
 
 
 def _gelu() -> nn.GELU:

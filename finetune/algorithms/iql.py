@@ -23,15 +23,14 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.noise import share_of
+from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions, share_of
 from finetune.algorithms.td3_bc import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
@@ -114,9 +113,7 @@ class IQL(Algorithm):
         with torch.no_grad():
             # V of the next state, not Q of an action that the policy chose there: nothing unseen is evaluated
             target = batch.reward + self.settings.gamma * batch.discount * self.value(next_z)[:, 0]
-        first, second = self.critic(z, batch.action)
-        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
+        return self.critic.loss(z, batch.action, target)
 
     def value_loss(self, batch: FeatureBatch, q: Tensor) -> Loss:
         """Expectile loss of V to the (B,) smaller target value of the actions taken."""
@@ -142,19 +139,6 @@ class IQL(Algorithm):
         done = share_of(self.updates, self.planned)
         cosine = torch.cos(math.pi * done) if isinstance(done, Tensor) else math.cos(math.pi * done)
         return self.learning_rate * (1 + cosine) / 2
-
-    def parts(self) -> dict[str, Any]:
-        """Networks, target and optimisers."""
-        return {
-            "policy": self.policy,
-            "gaussian": self.gaussian,
-            "critic": self.critic,
-            "target_critic": self.target_critic,
-            "value": self.value,
-            "policy_optimiser": self.policy_optimiser,
-            "critic_optimiser": self.critic_optimiser,
-            "value_optimiser": self.value_optimiser,
-        }
 
 
 def expectile_loss(error: Tensor, expectile: float) -> Tensor:

@@ -74,6 +74,7 @@ class ReBRAC(TD3BC):
         self, policy: Policy, options: ReBRACOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
+        # in place of TD3+BC's, which are drawn before: weights of the same seed stay those of the published rows
         critic = NormedCritics(**policy.shape, layers=options.critic_layers, kind=nn.ReLU(), eps=1e-5)
         self.critic = critic.to(policy.standardise.mean.device)
         self.target_critic = copy.deepcopy(self.critic)

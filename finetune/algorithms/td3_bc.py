@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -53,6 +53,12 @@ class TwinCritic(nn.Module):
         """Both values."""
         both = torch.cat([z, action], dim=-1)
         return self.first(both)[:, 0], self.second(both)[:, 0]
+
+    def loss(self, z: Tensor, action: Tensor, target: Tensor) -> Loss:
+        """Sum of both values' squared errors to one (B,) target; it logs the first value's mean as `q`."""
+        first, second = self(z, action)
+        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
 
 
 class TD3BC(Algorithm):
@@ -101,9 +107,8 @@ class TD3BC(Algorithm):
             value, logs = self._next_value(batch, next_z, self._next_action(next_z, noise))
             # `discount` is 0 if the task itself ended within the n steps; a time limit ends nothing, so it bootstraps
             target = batch.reward + self.settings.gamma * batch.discount * value
-        first, second = self.critic(z, batch.action)
-        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()} | logs)
+        loss = self.critic.loss(z, batch.action, target)
+        return Loss(loss.value, loss.logs | logs)
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
         """Cloning less the value, in units of the value's own size."""
@@ -137,14 +142,3 @@ class TD3BC(Algorithm):
         """Move the target networks by the share tau of the way."""
         move_target(self.target_critic, self.critic, self.tau)
         move_target(self.target_policy.net, self.policy.net, self.tau)
-
-    def parts(self) -> dict[str, Any]:
-        """Networks, targets and optimisers."""
-        return {
-            "policy": self.policy,
-            "critic": self.critic,
-            "target_policy": self.target_policy,
-            "target_critic": self.target_critic,
-            "policy_optimiser": self.policy_optimiser,
-            "critic_optimiser": self.critic_optimiser,
-        }

@@ -8,8 +8,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from finetune.algorithms import ALGORITHMS, noise, td3_bc
-from finetune.algorithms.bc import BC
+from finetune.algorithms import ALGORITHMS, td3_bc
+from finetune.algorithms import bc as noise_module
+from finetune.algorithms.bc import BC, noise_at, with_noise
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.fql import FQL, FQLOptions
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
@@ -49,8 +50,8 @@ def batch(seed: int = 0) -> FeatureBatch:
 def silent(monkeypatch):
     """No noise on any action."""
     monkeypatch.setattr(td3_bc, "TARGET_NOISE", 0.0)
-    monkeypatch.setattr(noise, "NOISE_START", 0.0)
-    monkeypatch.setattr(noise, "NOISE_END", 0.0)
+    monkeypatch.setattr(noise_module, "NOISE_START", 0.0)
+    monkeypatch.setattr(noise_module, "NOISE_END", 0.0)
 
 
 @pytest.mark.parametrize("kind", [TD3BC, DrQv2BC])
@@ -74,7 +75,7 @@ def test_critics_learn_the_reward_and_the_smaller_discounted_value_of_the_next_a
 @pytest.mark.parametrize(("kind", "clip"), [(TD3BC, 0.5), (DrQv2BC, 0.3)])
 def test_noise_on_the_next_action_is_clipped_and_so_is_the_action(monkeypatch, kind, clip):
     monkeypatch.setattr(td3_bc, "TARGET_NOISE", 1e6)
-    monkeypatch.setattr(noise, "NOISE_START", 1e6)
+    monkeypatch.setattr(noise_module, "NOISE_START", 1e6)
     algorithm, given, seen = make(kind), batch(), []
     real = algorithm.target_critic.forward
     algorithm.target_critic.forward = lambda z, action: (seen.append(action), real(z, action))[1]
@@ -108,7 +109,7 @@ def test_the_actor_maximises_the_value_in_units_of_its_own_size_beside_cloning(s
 
 
 def test_drqv2s_noise_decays_linearly_and_then_stays():
-    found = [noise.noise_at(updates, 10**6) for updates in (0, 125_000, 250_000, 10**6)]
+    found = [noise_at(updates, 10**6) for updates in (0, 125_000, 250_000, 10**6)]
     assert found == pytest.approx([1.0, 0.55, 0.1, 0.1])
 
 
@@ -117,7 +118,7 @@ def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monke
     """Else a clone near a bound is pushed to it: what the data's mean action is held against has the noise cut off."""
     stds = []
     module = sys.modules[kind.__module__]
-    monkeypatch.setattr(module, "noise_at", lambda *told: stds.append(noise.noise_at(*told)) or stds[-1])
+    monkeypatch.setattr(module, "noise_at", lambda *told: stds.append(noise_at(*told)) or stds[-1])
     algorithm = make(kind)  # of 40 updates
     for number in range(40):
         algorithm.update(batch(number))
@@ -128,7 +129,7 @@ def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monke
 
 def test_noise_is_cut_off_with_the_action_and_lets_the_whole_gradient_pass():
     action = torch.linspace(-1, 1, 2001).requires_grad_()
-    noisy = noise.with_noise(action, 10.0 * torch.randn(2001, generator=torch.Generator().manual_seed(0)))
+    noisy = with_noise(action, 10.0 * torch.randn(2001, generator=torch.Generator().manual_seed(0)))
     noisy.sum().backward()
     assert torch.equal(action.grad, torch.ones_like(action))
     moved = noisy.detach() - action.detach()

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from finetune import trainer
-from finetune.path import DataPath
 from finetune.train import finetune
+from finetune.trainer import path_error
 from tests.finetune.conftest import BRIEF
 from tests.helpers_data import fake_rows
 from tests.helpers_stages import smoke_finetune
@@ -47,10 +47,10 @@ def test_simulator_states_are_observed_as_in_the_environment(walked):
 def test_the_path_error_is_to_the_actors_mean_action_at_the_same_row(walked):
     folder, states, actor = walked
     shown = torch.from_numpy(np.stack([actor.act(state) for state in states]))
-    path = DataPath(open_dataset(folder), actor, lambda number: shown[number * ROWS : (number + 1) * ROWS])
-    assert path.action_error(lambda z: z) == pytest.approx(0, abs=1e-10)
-    assert path.action_error(lambda z: z + 0.1) == pytest.approx(0.01, rel=1e-4)
-    assert path.action_error(lambda z: z.roll(1, 0)) > 0.01, "the rows differ"
+    path = open_dataset(folder), actor, lambda number: shown[number * ROWS : (number + 1) * ROWS]
+    assert path_error(*path, lambda z: z) == pytest.approx(0, abs=1e-10)
+    assert path_error(*path, lambda z: z + 0.1) == pytest.approx(0.01, rel=1e-4)
+    assert path_error(*path, lambda z: z.roll(1, 0)) > 0.01, "the rows differ"
 
 
 def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
@@ -60,8 +60,8 @@ def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
     monkeypatch.setattr(dataset, "episode_start", torch.tensor([0, ROWS, ROWS + 1]))
     monkeypatch.setattr(dataset, "episode_end", ends)
     shown = torch.from_numpy(np.stack([actor.act(state) for state in states]))
-    path = DataPath(dataset, actor, lambda number: shown[dataset.episode_start[number] : ends[number]])
-    assert path.action_error(lambda z: z + 0.1) == pytest.approx(0.01, rel=1e-4)
+    path = dataset, actor, lambda number: shown[dataset.episode_start[number] : ends[number]]
+    assert path_error(*path, lambda z: z + 0.1) == pytest.approx(0.01, rel=1e-4)
 
 
 @pytest.mark.parametrize("views", [1, 0])

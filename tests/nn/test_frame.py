@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.nn.frame import FrameOptions, StateFrame, make_frame_encoder
+from vd4rl_pomdp.nn.frame import StateFrame, make_frame_encoder
 
 
 def test_a_state_of_another_width_is_refused_in_a_line():
@@ -14,7 +14,7 @@ def test_a_state_of_another_width_is_refused_in_a_line():
 
 @pytest.mark.parametrize("size", [84, 83])
 def test_half_the_resolution_is_means_over_two_by_two_pixels_and_none_is_lost(size: int):
-    encoder = make_frame_encoder("nature_half", 1, size, FrameOptions(8)).double()
+    encoder = make_frame_encoder("nature_half", 1, size, {"feature_dim": 8}).double()
     picture = torch.randint(0, 128, (1, 1, size, size)).double() * 2
     moved = picture.clone()
     moved[..., 10, 20:22] += torch.tensor([1.0, -1.0])

@@ -34,7 +34,7 @@ def test_conditions_are_told_side_by_side_with_what_differs(tmp_path):
     assert acro["settings"] == "views 4 → 1, steps 20 → 60"
     assert (curl["score_a"], curl["score_b"], curl["seeds_b"], curl["difference"]) == (None, 50.0, 1, None)
     assert (mik["score_a"], mik["score_b"], mik["settings"]) == (30.0, None, "")
-    assert [side.others for side in found.sides] == [0, 1], "an unfinished run has no score"
+    assert [side["others"] for side in found.sides] == [0, 1], "an unfinished run has no score"
 
 
 def test_a_set_against_itself_differs_in_nothing(tmp_path):

@@ -6,8 +6,7 @@ import pytest
 from tests.helpers_report import describe, pooled, write_run
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report import write_report
-from vd4rl_pomdp.report.gaps import find_gaps
-from vd4rl_pomdp.report.load import Choice, episodes_frame, load_runs, runs_frame
+from vd4rl_pomdp.report.load import Choice, episodes_frame, find_gaps, load_runs, runs_frame
 from vd4rl_pomdp.report.page import unlike
 from vd4rl_pomdp.runs.files import read_json, write_json
 

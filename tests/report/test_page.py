@@ -370,7 +370,8 @@ def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
     for seed, told in enumerate(({}, after)):
         run = describe(write_run(tmp_path / f"runs/{seed}", "mine", seed, {10: [1.0]}), {}, "one")
         write_json(run / "config.json", read_json(run / "config.json") | told)
-        write_json(run / "encoder/config.json", read_json(run / "encoder/config.json") | {"origin": before})
+        kept = {"origin": before} if seed else before  # as earlier versions kept it, and as it is kept now
+        write_json(run / "encoder/config.json", read_json(run / "encoder/config.json") | kept)
     other = describe(write_run(tmp_path / "runs/other", "random", 0, {10: [1.0]}), data="two")
     words = ["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
     main(words)

@@ -31,7 +31,8 @@ def test_iqm_drops_the_outer_quarters():
 def test_other_statistics_on_known_values():
     assert stats.optimality_gap(np.array([50.0, 150.0])) == pytest.approx(25.0)
     assert stats.probability_of_improvement([np.array([1.0, 2.0])], [np.array([1.0, 0.0])]) == pytest.approx(0.875)
-    assert stats.median_of_tasks([2, 1, 1])(np.array([0.0, 4.0, 9.0, 1.0])) == 2.0, "of the tasks' means 2, 9, 1"
+    tasks = [np.array([0.0, 4.0]), np.array([9.0]), np.array([1.0])]
+    assert stats.aggregates(tasks)["median"](np.concatenate(tasks)) == 2.0, "of the tasks' means 2, 9, 1"
     assert stats.performance_profile(np.array([1.0, 3.0]), np.array([0.0, 2.0, 4.0])).tolist() == [1.0, 0.5, 0.0]
 
 

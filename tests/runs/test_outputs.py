@@ -13,7 +13,7 @@ import pytest
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.core.errors import InUseError, UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.outputs import in_use, kept_in, owned, refuse_foreign, refuse_inside
 
 
@@ -147,7 +147,7 @@ def test_a_second_process_is_told_who_holds_a_folder_until_that_one_dies(tmp_pat
         assert holder.stdout.readline() == "owned\n"
         assert in_use(tmp_path / "run")
         told = rf"run: is in use by process {holder.pid} on {socket.gethostname()} since \d{{4}}-\d\d-\d\d .* UTC; wait"
-        with pytest.raises(InUseError, match=told), owned(tmp_path / "run"):
+        with pytest.raises(UserError, match=told), owned(tmp_path / "run"):
             pass
         holder.send_signal(signal.SIGKILL)
     assert not in_use(tmp_path / "run")

@@ -11,7 +11,7 @@ from tests.helpers_report import describe, without_figures, write_run
 from tests.helpers_stages import contents
 from vd4rl_pomdp.cli import main, sweeps
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates
+from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, NEEDS_NOT, OPEN, judge
 
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -15,13 +15,13 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.results import find_results
+from vd4rl_pomdp.runs.results import Result, find_results
 from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
-from vd4rl_pomdp.sweeps.plan import DATA, FoundRun, plan_jobs, runs_below, runs_kept
+from vd4rl_pomdp.sweeps.plan import DATA, plan_jobs, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
 GRID = """
@@ -316,7 +316,7 @@ def test_a_seed_may_have_a_set_of_its_own(copy, tmp_path):
     cells = load_grid(str(copy / "grid.toml")).cells()
     for collected, number in ((100, 4), (101, 0)):  # seed 0's policies count on the set of seed 0 alone
         wanted = {"collection": collection_of(cells[0]) | {"seed": collected}}
-        kept = [replace(run, record=run.record | wanted) for run in runs_below(copy)]
+        kept = [replace(run, files=run.files | {"config": run.record | wanted}) for run in runs_below(copy)]
         done = [job for job in plan(copy, kept=kept, out=tmp_path / "out") if job.done]
         assert ({job.section for job in done}, len(done)) == ({"finetune"} if number else set(), number)
 
@@ -347,7 +347,7 @@ def test_a_run_that_added_other_images_is_another(tmp_path):
     Image.new("RGB", (9, 9), "red").save(tmp_path / "one.png")
     config = {"seed": 0, "exogenous": str(tmp_path)}
     record = {"stage": "navigation", "config": config, "inputs": {"exogenous": source_fingerprint(str(tmp_path))}}
-    run = FoundRun(tmp_path / "run", record, {}, True)
+    run = Result("", tmp_path / "run", {"config": record}, 0, [], [], True)
     assert module._found({run.recipe: [run]}, run.recipe, AnySet()) is run
     Image.new("RGB", (9, 9), "blue").save(tmp_path / "one.png")
     module._images_in.cache_clear()

@@ -15,10 +15,9 @@ from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.results import read_run
 from vd4rl_pomdp.sweeps import driver
-from vd4rl_pomdp.sweeps.driver import Driver
+from vd4rl_pomdp.sweeps.driver import Driver, in_stacks, width_of, words_of_stack
 from vd4rl_pomdp.sweeps.folder import SweepFolder, is_finished
 from vd4rl_pomdp.sweeps.options import LocalOptions
-from vd4rl_pomdp.sweeps.stacks import in_stacks, width_of, words_of_stack
 
 
 @pytest.fixture(autouse=True)

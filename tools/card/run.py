@@ -27,11 +27,9 @@ import signal
 import subprocess
 import sys
 import tarfile
-import tempfile
 import threading
 import time
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -117,21 +115,13 @@ class Session:
         return process.returncode, "".join(lines)
 
     def describe(self) -> None:
-        """Tell the machine, and the versions that are used."""
+        """Tell the machine and its torch."""
         found = (
             "import torch; print(torch.__version__, *map(torch.cuda.get_device_name, range(torch.cuda.device_count())))"
         )
         code, told = self.run([sys.executable, "-c", found], 90, quiet=True)
         self.gpu = len(told.split()) > 1
         self.say(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, torch {told.strip()} ({code})")
-        sys.path.insert(0, str(HERE / "site"))
-        names = ("vd4rl-pomdp", "numpy", "scipy", "mujoco", "h5py", "scikit-learn", "matplotlib", "jax", "filelock")
-        for name in names:
-            try:
-                self.write(f"{name} {version(name)}, ")
-            except PackageNotFoundError:
-                self.write(f"no {name}, ")
-        self.write("\n")
 
     def find_renderer(self) -> None:
         """Choose the first environment in which a frame is drawn: the machine's own, or with what was packed."""
@@ -152,28 +142,6 @@ class Session:
         self.env = before | (found or {})
         if found is None:
             self.say(f"nothing draws here: {told.strip()[-500:]}")
-
-    def share_gpu(self) -> bool:
-        """Start NVIDIA's Multi-Process Service, if it is there and works; whether it runs."""
-        if not shutil.which("nvidia-cuda-mps-control"):
-            self.say("no Multi-Process Service here")
-            return False
-        folder, before = tempfile.mkdtemp(prefix="mps"), dict(self.env)
-        self.env |= {"CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
-        subprocess.run(["nvidia-cuda-mps-control", "-d"], env=self.env, stdout=subprocess.DEVNULL, check=False)
-        code, told = self.run(
-            [sys.executable, "-c", "import torch; print(torch.ones(9, device='cuda').sum())"], 60, True
-        )
-        self.say("Multi-Process Service runs" if code == 0 else f"it does not work: {told[-300:]}")
-        if code:
-            self.stop_sharing()
-            self.env = before
-        return code == 0
-
-    def stop_sharing(self) -> None:
-        """End the Multi-Process Service."""
-        with suppress(subprocess.TimeoutExpired):
-            subprocess.run(["nvidia-cuda-mps-control"], input=b"quit\n", env=self.env, timeout=10, check=False)
 
 
 class GridPart:
@@ -265,7 +233,6 @@ def main() -> None:
     parser.add_argument("--home", type=Path, help="the --out of an earlier call")
     parser.add_argument("--seconds", type=float, default=570, help="all of it, packing included")
     parser.add_argument("--bring", type=float, default=0, metavar="MIB", help="encoders, up to this size in all")
-    parser.add_argument("--mps", action="store_true", help="share the GPU by NVIDIA's Multi-Process Service")
     words = sys.argv[1:]
     at = words.index("--") if "--" in words else len(words)
     told, flags = parser.parse_args(words[:at]), words[at + 1 :]
@@ -279,7 +246,6 @@ def main() -> None:
             shutil.copytree(told.home / "results", told.out / "results", dirs_exist_ok=True)
     session.describe()
     session.find_renderer()
-    shares = told.mps and session.share_gpu()
     try:
         parts = [(name, float(limit or "inf")) for name, _, limit in (part.partition("=") for part in told.parts)]
         grids = {n: GridPart(session, n, told.work, told.home, flags) for n, _ in parts if n not in ("tests", "bench")}
@@ -297,8 +263,6 @@ def main() -> None:
     finally:
         for process in session.processes:
             process.terminate()
-        if shares:
-            session.stop_sharing()
         bring_home(session, told.work / "runs", told.out, told.bring)
         session.say("done")
 

@@ -13,12 +13,12 @@ import statistics
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 
@@ -143,7 +143,7 @@ def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
 
 def measured(make: Callable[[], Callable[[], Any]], device: torch.device, steps: int, blocks: int) -> dict[str, float]:
     """Milliseconds of a step, run as it is and replayed, and the memory that replaying it takes at most."""
-    with eager():
+    with patch.dict(os.environ, {EAGER_VARIABLE: "1"}):  # what is made here is never replayed
         slow = milliseconds(make(), device, max(1, steps // 4), max(1, blocks // 2))
     free(device)
     step = make()
@@ -167,19 +167,6 @@ def milliseconds(step: Callable[[], Any], device: torch.device, steps: int, bloc
         wait(device)
         times.append((time.perf_counter() - start) / steps * 1e3)
     return statistics.median(times)
-
-
-@contextmanager
-def eager() -> Iterator[None]:
-    """What is made here is never replayed."""
-    before = os.environ.get(EAGER_VARIABLE)
-    os.environ[EAGER_VARIABLE] = "1"
-    try:
-        yield
-    finally:
-        del os.environ[EAGER_VARIABLE]
-        if before is not None:
-            os.environ[EAGER_VARIABLE] = before
 
 
 def wait(device: torch.device) -> None:
@@ -302,7 +289,7 @@ def pretraining_steps(folder: str, device: str, size: dict[str, Any], seconds: f
 
 def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: float) -> dict[str, Any]:
     """The same update in JAX: on this card if JAX sees it, and only then a ratio."""
-    if importlib.util.find_spec("jax") is None:
+    if importlib.util.find_spec("optax") is None:
         return {"jax": JAX_MISSING}
     shape = {
         "hidden_dim": size.hidden_dim,

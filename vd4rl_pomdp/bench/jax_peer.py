@@ -7,26 +7,18 @@ JAX comes with the extra `policy`: this module is imported only where the peer i
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from jax import Array
 from torch import Tensor, nn
 
 from finetune.algorithms.td3_bc import NOISE_CLIP, TARGET_NOISE, TD3BC
 
-BETAS, EPS = (0.9, 0.999), 1e-8
 Net = list[tuple[Array, Array]]
 """Weights (inputs, outputs) and biases of a perceptron's layers."""
-
-
-class Moments(NamedTuple):
-    """An optimiser's state."""
-
-    steps: Array
-    first: Any
-    second: Any
 
 
 class Learnt(NamedTuple):
@@ -36,8 +28,8 @@ class Learnt(NamedTuple):
     critics: tuple[Net, Net]
     target_policy: Net
     target_critics: tuple[Net, Net]
-    policy_adam: Moments
-    critic_adam: Moments
+    policy_adam: optax.OptState
+    critic_adam: optax.OptState
 
 
 class Table(NamedTuple):
@@ -76,7 +68,8 @@ def learnt_by(algorithm: TD3BC) -> Learnt:
     """The weights of an algorithm that has made no update."""
     policy, target_policy = net(algorithm.policy.net), net(algorithm.target_policy.net)
     critics, targets = ((net(twin.first), net(twin.second)) for twin in (algorithm.critic, algorithm.target_critic))
-    return Learnt(policy, critics, target_policy, targets, new_adam(policy), new_adam(critics))
+    adam = optax.adam(algorithm.learning_rate)
+    return Learnt(policy, critics, target_policy, targets, adam.init(policy), adam.init(critics))
 
 
 def net(module: nn.Sequential) -> Net:
@@ -87,12 +80,6 @@ def net(module: nn.Sequential) -> Net:
 def as_jax(tensor: Tensor) -> Array:
     """A copy of a tensor, where JAX computes."""
     return jnp.array(tensor.detach().cpu().numpy())
-
-
-def new_adam(weights: Any) -> Moments:
-    """The state before the first step."""
-    zeros = [jax.tree.map(jnp.zeros_like, weights) for _ in range(2)]
-    return Moments(jnp.zeros((), jnp.int32), *zeros)
 
 
 def draw(key: Array, table: Table, updates: int, batch_size: int) -> BatchDraws:
@@ -113,6 +100,7 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tupl
     `critic_loss` (U / 2, 2) and `actor_loss` (U / 2,).
     """
     gamma, alpha, tau = algorithm.settings.gamma, algorithm.settings.alpha, algorithm.tau
+    optimiser = optax.adam(algorithm.learning_rate)
 
     def critic_loss(critics: tuple[Net, Net], learnt: Learnt, table: Table, draws: BatchDraws) -> Array:
         z, action, next_z = batch(table, draws)
@@ -134,11 +122,12 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tupl
         for turn in range(2):
             drawn = BatchDraws(*(numbers[turn] for numbers in draws))
             loss, gradient = jax.value_and_grad(critic_loss)(learnt.critics, learnt, table, drawn)
-            critics, adam = adam_step(learnt.critics, learnt.critic_adam, gradient, algorithm.learning_rate)
-            learnt = learnt._replace(critics=critics, critic_adam=adam)
+            step, adam = optimiser.update(gradient, learnt.critic_adam)
+            learnt = learnt._replace(critics=optax.apply_updates(learnt.critics, step), critic_adam=adam)
             losses.append(loss)
         loss, gradient = jax.value_and_grad(actor_loss)(learnt.policy, learnt, table, drawn)
-        policy, adam = adam_step(learnt.policy, learnt.policy_adam, gradient, algorithm.learning_rate)
+        step, adam = optimiser.update(gradient, learnt.policy_adam)
+        policy = optax.apply_updates(learnt.policy, step)
         learnt = learnt._replace(policy=policy, policy_adam=adam)
         moved = [
             jax.tree.map(lambda old, new: old + tau * (new - old), *both)
@@ -173,13 +162,3 @@ def values(critics: tuple[Net, Net], z: Array, action: Array) -> tuple[Array, Ar
     """Both critics' values (B,)."""
     both = jnp.concatenate([z, action], -1)
     return forward(critics[0], both)[:, 0], forward(critics[1], both)[:, 0]
-
-
-def adam_step(weights: Any, adam: Moments, gradient: Any, learning_rate: float) -> tuple[Any, Moments]:
-    """Adam (Kingma & Ba 2015, arXiv 1412.6980), in PyTorch's order of operations."""
-    steps = adam.steps + 1
-    first = jax.tree.map(lambda m, g: m + (1 - BETAS[0]) * (g - m), adam.first, gradient)
-    second = jax.tree.map(lambda v, g: BETAS[1] * v + (1 - BETAS[1]) * g * g, adam.second, gradient)
-    size, scale = learning_rate / (1 - BETAS[0] ** steps), jnp.sqrt(1 - BETAS[1] ** steps)
-    moved = jax.tree.map(lambda w, m, v: w - size * m / (jnp.sqrt(v) / scale + EPS), weights, first, second)
-    return moved, Moments(steps, first, second)

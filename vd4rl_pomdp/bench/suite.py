@@ -387,7 +387,7 @@ def _updates_per_s(
 
 def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 1024)) -> dict[str, Any]:
     """Milliseconds of a TD3+BC update, sampling included, and how many times as long float32 in JAX takes."""
-    if importlib.util.find_spec("jax") is None:
+    if importlib.util.find_spec("optax") is None:
         return {"jax": JAX_MISSING}
     results: dict[str, Any] = {}
     features = random_features(dataset, FinetuneConfig.of("cpu").views)

@@ -88,7 +88,7 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
     """
     from vd4rl_pomdp.runs.results import add_results
 
-    print(f"{out}: {add_results(_named(runs), out).in_words}")
+    print(f"{out}: {add_results(_named(runs), out)}")
 
 
 @command
@@ -185,8 +185,8 @@ def certify(
     """
     from vd4rl_pomdp.cli.sweeps import carry_out
     from vd4rl_pomdp.core.errors import refuse_no_folder
-    from vd4rl_pomdp.runs.certificates import CERTIFICATES, in_words
     from vd4rl_pomdp.runs.outputs import refuse_kept
+    from vd4rl_pomdp.runs.results import CERTIFICATES, certificate_in_words
     from vd4rl_pomdp.studies.certify import GRID, certify, planned
     from vd4rl_pomdp.sweeps.folder import SweepFolder
     from vd4rl_pomdp.sweeps.options import LocalOptions
@@ -201,7 +201,7 @@ def certify(
         refuse_unknown_to_jobs(training.settings)
     folder = SweepFolder(out)
     carry_out([folder.keep_plan(GRID, trainings, own_program())], folder, "local", options)
-    print(f"{corruption}: {in_words(certify(dataset, cells, out, returns))}")
+    print(f"{corruption}: {certificate_in_words(certify(dataset, cells, out, returns))}")
     print(f"certificate: {out / CERTIFICATES}")
 
 

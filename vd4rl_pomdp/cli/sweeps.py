@@ -107,7 +107,7 @@ def run(words: list[str], program: str) -> None:
 
 def _print_plan(jobs: list[Job], stack: int) -> None:
     """Every job as one line of shell, what is shared, and how many processes that makes."""
-    from vd4rl_pomdp.sweeps.stacks import in_stacks
+    from vd4rl_pomdp.sweeps.driver import in_stacks
 
     users = Counter(name for job in jobs for name in job.needs)
     left: list[Job] = []

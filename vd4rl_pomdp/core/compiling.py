@@ -33,7 +33,11 @@ def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], An
             if failed or not on_gpu or (training and not torch.is_grad_enabled()):
                 return function(*args)
             try:
-                compiled = compiled or _compile(function)
+                if compiled is None:
+                    from torch._functorch import config  # only here: it takes seconds to import what compiles
+
+                    config.donated_buffer = False  # or a loss could not keep its graph for a second gradient
+                    compiled = torch.compile(function)
                 return compiled(*args)
             except torch.OutOfMemoryError:
                 raise
@@ -47,10 +51,3 @@ def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], An
         return call
 
     return decorate
-
-
-def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
-    import torch._functorch.config  # only here: it takes seconds to import what compiles
-
-    torch._functorch.config.donated_buffer = False  # or a loss could not keep its graph for a second gradient
-    return torch.compile(function)

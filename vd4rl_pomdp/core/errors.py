@@ -44,10 +44,6 @@ class DiskFullError(UnavailableError):
     """No space was left where something was to be written."""
 
 
-class InUseError(UserError):
-    """Another process owns the folder."""
-
-
 class WorkerDiedError(UserError):
     """A process that helped was ended from outside."""
 

@@ -158,7 +158,17 @@ def flat(config: Any) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     owners: dict[str, str] = {}
-    for owner, name, value in _settings(config):
+
+    def settings(config: Any) -> Iterator[tuple[str, str, Any]]:
+        for field in fields(config):
+            value = getattr(config, field.name)
+            nested = options_in(value)
+            if nested is None:
+                yield type(config).__name__, field.name, value
+            for options in nested or ():
+                yield from settings(options)
+
+    for owner, name, value in settings(config):
         if name in found:
             raise UserError(
                 f"{owners[name]} and {owner} both have the setting {name!r}, and {flag_of(name)} cannot set two: "
@@ -166,17 +176,6 @@ def flat(config: Any) -> dict[str, Any]:
             )
         found[name], owners[name] = value, owner
     return found
-
-
-def _settings(config: Any) -> Iterator[tuple[str, str, Any]]:
-    """Class, name and value of every setting of a config, its options' included."""
-    for field in fields(config):
-        value = getattr(config, field.name)
-        nested = options_in(value)
-        if nested is None:
-            yield type(config).__name__, field.name, value
-        for options in nested or ():
-            yield from _settings(options)
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:

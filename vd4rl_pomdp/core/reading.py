@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from zipfile import BadZipFile
 
 from vd4rl_pomdp.core.errors import UserError, disk_error
 
@@ -14,6 +19,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 T = TypeVar("T")
+_PARSING = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, csv.Error, BadZipFile, zlib.error)
+"""What those who parse a damaged file raise."""
 
 
 def regular(path: Path) -> Path:
@@ -44,6 +51,17 @@ def parse_json(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+
+
+@contextmanager
+def damaged(where: Path | str, what: str, remedy: str = "") -> Iterator[None]:
+    """Within the block a file's content is read: whatever is wrong with it becomes "where: what (error); remedy"."""
+    try:
+        yield
+    except UserError:
+        raise
+    except _PARSING as error:
+        raise UserError(f"{where}: {what} ({error})" + (f"; {remedy}" if remedy else "")) from error
 
 
 def build(kind: type[T], values: Any) -> T:

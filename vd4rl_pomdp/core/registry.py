@@ -50,8 +50,9 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Offered parts that cannot be loaded, and why."""
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
-        self._sources: dict[str, str] = {}
-        """Of parts that are not this package's: the file and its hash when it was loaded, since that is what runs."""
+        self.sources: dict[str, str] = {}
+        """Of parts that are not this package's, but for a notebook's cells: the file that registered or offers them and
+        its hash when it was loaded, since that is what runs."""
         self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
         REGISTRIES[self.setting] = self
@@ -79,11 +80,11 @@ class Registry(Mapping[str, Part], Generic[Part]):
     def isolated(self) -> Iterator[None]:
         """Within the block parts may be registered; after it they are forgotten, as tests want it."""
         self._load_offered()
-        before = dict(self._parts), dict(self._origins), dict(self._sources)
+        before = dict(self._parts), dict(self._origins), dict(self.sources)
         try:
             yield
         finally:
-            self._parts, self._origins, self._sources = before
+            self._parts, self._origins, self.sources = before
 
     def named(self, name: str) -> Part:
         """The part called `name`; raises UserError listing the choices, or saying why it cannot be loaded."""
@@ -99,10 +100,6 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Where a part comes from: a package and its version, a call, or "" for this package's own."""
         self._load_offered()
         return self._origins.get(name, "")
-
-    def source(self, name: str) -> str:
-        """The file that registered or offers a part, and its hash; "" for this package's own, or a notebook's cell."""
-        return self._sources.get(name, "")
 
     def __getitem__(self, name: str) -> Part:
         self._load_offered()
@@ -131,10 +128,9 @@ class Registry(Mapping[str, Part], Generic[Part]):
         except UserError as error:
             raise UserError(f"{self.kind} {name!r}: {error}") from None
         self._parts[name], self._origins[name] = part, origin
-        path = Path(file)
-        # Hashed now: the file may be edited while this process runs what it said before.
-        content = path.read_bytes() if path.is_file() else None
-        self._sources[name] = "" if content is None else f"{path.name} {sha256(content).hexdigest()[:12]}"
+        self.sources.pop(name, None)
+        if (path := Path(file)).is_file():  # hashed now: it may be edited while this process runs what it said before
+            self.sources[name] = f"{path.name} {sha256(path.read_bytes()).hexdigest()[:12]}"
 
     def _load_offered(self) -> None:
         """Add what installed packages offer; what cannot be loaded is told of once, and left out."""
@@ -153,22 +149,24 @@ class Registry(Mapping[str, Part], Generic[Part]):
                 print(warning, file=sys.stderr)
 
 
-def origins(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Where the parts come from that settings name and that are not this package's own: {"method mine": "its 1.2"}.
-
-    Args:
-        settings: a stage's settings by name; those that name parts are called as the registries' `setting`.
-    """
-    return {part: origin for part, registry, name in _named(settings) if (origin := registry.origin(name))}
-
-
 def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     """What a record keeps of the parts that settings name and that are not this package's own.
 
-    `plugins` are their `origins`; `sources` their files and hashes of them: {"method mine": "mine.py 0123456789ab"}.
+    Args:
+        settings: a stage's settings by name; those that name parts are called as the registries' `setting`.
+
+    Returns:
+        `plugins`: where they come from, {"method mine": "its 1.2"}.
+        `sources`: their files and hashes of them, {"method mine": "mine.py 0123456789ab"}.
     """
-    files = {part: registry.source(name) for part, registry, name in _named(settings)}
-    return {"plugins": origins(settings), "sources": {part: file for part, file in files.items() if file}}
+    plugins, sources = dict[str, str](), dict[str, str]()
+    for setting, registry in list(REGISTRIES.items()):  # a package that is loaded may make further ones
+        value = str(settings.get(setting, ""))
+        for name in [value] if value in registry else value.split("+"):
+            part = f"{setting} {name}"
+            plugins |= {part: origin} if (origin := registry.origin(name)) else {}
+            sources |= {part: registry.sources[name]} if name in registry.sources else {}
+    return {"plugins": plugins, "sources": sources}
 
 
 def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
@@ -189,12 +187,3 @@ def warn_of_other_code(place: object, record: Mapping[str, Any], settings: Mappi
     """
     for part in of_other_code(record, settings):
         print(f"warning: {place}: the code of {part} has changed since {what}", file=sys.stderr)
-
-
-def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Registry[Any], str]]:
-    """The parts that settings name: setting and name, the registry that has it, and the name."""
-    for setting, registry in list(REGISTRIES.items()):  # a package that is loaded may make further ones
-        value = str(settings.get(setting, ""))
-        for name in [value] if value in registry else value.split("+"):
-            if name in registry:
-                yield f"{setting} {name}", registry, name

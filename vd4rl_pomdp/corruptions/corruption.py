@@ -43,14 +43,6 @@ class Stage(Protocol):
         """
 
 
-def _assign(target: Tensor, index: tuple[Tensor, ...], value: int) -> None:
-    """`target[index] = value`; on a CPU by numpy, which is several times as fast."""
-    if buffers.in_host_memory(target):
-        target.numpy()[tuple(part.numpy() for part in index)] = value
-    else:  # as an assignment, the value would come from the CPU, and that be waited for
-        target.index_put_(index, torch.full((), value, dtype=target.dtype, device=target.device))
-
-
 @dataclass(frozen=True)
 class Patch(Options):
     """Squares of every frame, at uniformly random places, take one value."""
@@ -75,7 +67,11 @@ class Patch(Options):
         squares = frames.unfold(3, self.patch_size, 1).unfold(4, self.patch_size, 1)
         sample = torch.arange(n, device=key.device)[:, None, None]
         frame = torch.arange(k, device=key.device)[:, None]
-        _assign(squares.movedim(2, 4), (sample, frame, top, left), self.patch_fill)
+        target, index = squares.movedim(2, 4), (sample, frame, top, left)
+        if buffers.in_host_memory(target):  # where numpy is several times as fast
+            target.numpy()[tuple(part.numpy() for part in index)] = self.patch_fill
+        else:  # as an assignment, the value would come from the CPU, and that be waited for
+            target.index_put_(index, torch.full((), self.patch_fill, dtype=target.dtype, device=target.device))
 
     @property
     def hidden_value(self) -> int:

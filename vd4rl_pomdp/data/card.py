@@ -24,8 +24,8 @@ from vd4rl_pomdp.data.folder import (
     task_and_quality,
 )
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows, read_some_frames
-from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, in_words, read_certificates
 from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words, read_certificates
 
 FILM_FRAMES = 10
 LINES = 0.82
@@ -148,7 +148,7 @@ def _text(
         "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
         "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
     }
-    memory = {f"memory under {one['name']}": in_words(one) for one in read_certificates([path]).values()}
+    memory = {f"memory under {one['name']}": certificate_in_words(one) for one in read_certificates([path]).values()}
     rows |= memory or {"memory": NOT_CERTIFIED}
     lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
     table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())

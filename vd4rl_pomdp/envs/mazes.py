@@ -153,21 +153,16 @@ class MazeSpec:
 
     def hidden(self, states: np.ndarray) -> np.ndarray:
         """Whether a curtain covers all that could be seen of the ball: (..., P) states -> (...,) bool."""
-        reach, within = self.style.hidden_reach, self.style.hidden_within
+        reach, within, height = self.style.hidden_reach, self.style.hidden_within, self.style.camera_height
+        # how much larger than themselves a curtain's lower and upper faces appear at the ball's height
+        shadows = [1.0] if np.isinf(within) else [height / (height - z) for z in self.style.curtains]
         low, high = (np.clip(states[..., :2] + side, -within, within) for side in (-reach, reach))
         covered = np.zeros(states.shape[:-1], bool)
         for curtain in self.curtains:
-            for scale in self._shadows():
+            for scale in shadows:
                 center, half = scale * np.array(curtain.center), scale * np.array(curtain.half)
                 covered |= ((low >= center - half) & (high <= center + half)).all(-1)
         return covered
-
-    def _shadows(self) -> tuple[float, ...]:
-        """How much larger than themselves a curtain's lower and upper faces appear at the ball's height."""
-        if np.isinf(self.style.hidden_within):
-            return (1.0,)
-        height = self.style.camera_height
-        return tuple(height / (height - z) for z in self.style.curtains)
 
 
 _BEND = Curtain((1.0, 0.0), (0.5, 0.5))

@@ -49,17 +49,11 @@ class Adam(torch.optim.Adam):
             group.update(before)  # the tensor that a captured step reads stays the same one
             set_rate(group, rate)
             for parameter in self.state.keys() & set(group["params"]):
-                self.state[parameter] = {
-                    name: self._placed(name, value, parameter, group) for name, value in self.state[parameter].items()
-                }
-
-    @staticmethod
-    def _placed(name: str, value: Tensor, parameter: Tensor, group: dict[str, Any]) -> Tensor:
-        """A loaded tensor where, and laid out as, the step wants it."""
-        if name == "step":
-            return value.to(parameter.device if group["capturable"] or group["fused"] else "cpu", torch.float32)
-        # a fused step on a CPU walks through memory: in another layout it would pair the wrong numbers, in silence
-        return torch.empty_like(parameter).copy_(value)
+                counts = parameter.device if group["capturable"] or group["fused"] else "cpu"
+                loaded = self.state[parameter]
+                # a fused step on a CPU walks through memory: in another layout it would pair wrong numbers, in silence
+                moments = {k: torch.empty_like(parameter).copy_(v) for k, v in loaded.items() if k != "step"}
+                self.state[parameter] = {"step": loaded["step"].to(counts, torch.float32), **moments}
 
 
 def set_rate(group: dict[str, Any], rate: float | Tensor) -> None:

@@ -5,17 +5,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from vd4rl_pomdp.core.errors import UserError, first_line, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError, refuse_unknown
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import Windows
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
+from vd4rl_pomdp.nn.frame import STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.memory import Memory, make_memory, run_memory
 
 Readout = Literal["state", "frame", "frame+state"]
@@ -96,7 +96,7 @@ class EncoderRecord:
     probe: dict[str, float] = field(default_factory=dict)
     """Errors of linear probes, as `vd4rl_pomdp.nn.probes.probe_state` gives them; empty if none was fitted."""
     plugins: dict[str, str] = field(default_factory=dict)
-    """Where parts come from that are not this package's, as `registry.origins` tells."""
+    """Where parts come from that are not this package's, as `registry.code_of` tells."""
     sources: dict[str, str] = field(default_factory=dict)
     """Their files, as `registry.code_of` tells."""
 
@@ -107,11 +107,6 @@ class EncoderRecord:
         named = {"method": card.method, "task": card.task, "corruption": card.corruption["corruption"]}
         return named | {"frame_encoder": self.encoder.frame_encoder, "history": self.encoder.history}
 
-    @property
-    def code(self) -> dict[str, dict[str, str]]:
-        """What it says of their code, as `registry.code_of` does."""
-        return {"plugins": self.plugins, "sources": self.sources}
-
 
 class StreamState(NamedTuple):
     """What an encoder remembers between rows."""
@@ -120,21 +115,6 @@ class StreamState(NamedTuple):
     """(L, B, W); empty for memoryless encoders, and not read under a history window."""
     rows: Tensor
     """(B, L', F + A): the memory's last inputs under a history window, else empty."""
-
-
-def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
-    """The frame encoder of a config; raises UserError if it cannot read pictures of that size."""
-    told = {"feature_dim": config.feature_dim} | config.frame_options
-    options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
-    if unknown := told.keys() - asdict(options).keys():
-        raise UserError(f"frame encoder {config.frame_encoder!r} has no option {min(unknown)!r}")
-    try:
-        return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
-    except RuntimeError as error:
-        raise UserError(
-            f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels "
-            f"({first_line(error)}): choose another --frame-encoder, or a set of larger frames"
-        ) from error
 
 
 class Encoder(nn.Module):
@@ -148,7 +128,8 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
-            self.frame = frame = build_frame_encoder(config)
+            told = {"feature_dim": config.feature_dim} | config.frame_options
+            self.frame = frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, told)
             self.config = config = replace(config, frame_options=config.frame_options | frame.found)
         if config.history == "none":
             return
@@ -194,16 +175,13 @@ class Encoder(nn.Module):
     def encode(self, window: Windows) -> Tensor:
         """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); raises UserError for other pictures."""
         self._refuse_other(window.obs)
-        if (
-            self.memory is None
-            or not self.memory.first_only
-            or self.config.readout != "state"
-            or self.config.history_window
-        ):
-            return self.from_features(self.frame(window.obs), window.prev_action)
-        # the frame encoder's work on rows that are not read would be most of a step's
-        features = self.frame(window.obs[:, :1])
-        return self.from_features(pad(features, (0, 0, 0, window.obs.shape[1] - 1)), window.prev_action)
+        whole = self.config.readout == "state" and not self.config.history_window
+        if self.memory is not None and self.memory.first_only and whole:
+            # the frame encoder's work on rows that are not read would be most of a step's
+            features = pad(self.frame(window.obs[:, :1]), (0, 0, 0, window.obs.shape[1] - 1))
+        else:
+            features = self.frame(window.obs)
+        return self.from_features(features, window.prev_action)
 
     def from_features(self, features: Tensor, prev_action: Tensor) -> Tensor:
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
@@ -213,8 +191,11 @@ class Encoder(nn.Module):
         rows, span = self._rows(features, prev_action), self.config.history_window
         if span == 0 or rows.shape[1] <= span:
             return self._read(features, run_memory(self.memory, rows)[0])
-        states = torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
-        return self._read(features, states)
+        first = run_memory(self.memory, rows[:, :span])[0]
+        # Every later state is computed anew from the last `span` rows, the row itself among them.
+        recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)  # (B, T - span, span, I)
+        later = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))[0][:, -1]
+        return self._read(features, torch.cat([first, later.view(*recent.shape[:2], -1)], dim=1))
 
     def initial_state(self, batch: int) -> StreamState:
         """State before an episode's first row."""
@@ -269,14 +250,6 @@ class Encoder(nn.Module):
 
     def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features
-
-    def _over_last_rows(self, rows: Tensor, span: int) -> Tensor:
-        """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
-        assert self.memory is not None
-        # The first of these windows ends in row span - 1, whose state the plain pass over the first rows gives.
-        recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
-        states, _ = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))
-        return states[:, -1].view(*recent.shape[:2], -1)
 
     def _forget_first_action(self, rows: Tensor) -> Tensor:
         """A window's first row carries no earlier action."""

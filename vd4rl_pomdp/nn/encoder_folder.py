@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,11 @@ from safetensors import SafetensorError
 from safetensors.torch import save
 from torch.random import fork_rng
 
+from vd4rl_pomdp.core import __version__
 from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line, in_one_line
 from vd4rl_pomdp.core.reading import build, parse_json, read_bytes, read_tensors
 from vd4rl_pomdp.core.registry import code_of
 from vd4rl_pomdp.core.text import code, code_block, one_line
-from vd4rl_pomdp.core.version import __version__
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
@@ -162,7 +162,27 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
         repository: OWNER/NAME on the Hub from which the card's code loads it; empty: from the card's own folder.
         license: the licence that its owner gives it, as the Hub spells it; empty: the card names none.
     """
-    card = record.pretrain
+    card, shape = record.pretrain, record.encoder
+    if card.end_to_end:
+        budget = f"no pretraining: {code(card.end_to_end)} trains it with the policy"
+    elif record.frames == 0:
+        budget = "none: it is not trained"
+    else:
+        frames = f", {record.frames:,} frames" if record.frames else ""
+        budget = f"preset {code(card.preset)}, {card.steps:,} gradient steps{frames}"
+    probe = ", ".join(f"{name.removeprefix('probe_')} {error:.1f}%" for name, error in record.probe.items())
+    commit = f", commit {code(record.commit)}" if record.commit else ""
+    facts = {
+        "method": code(card.method),
+        "task, quality": f"{code(card.task)}, {code(card.quality)}",
+        "data": f"fingerprint {code(card.data)}" if card.data else "not recorded",
+        "corruption": code(json.dumps(card.corruption)),
+        "budget": budget,
+        "seed": str(card.seed),
+        "encoder": f"{code(shape.frame_encoder)}, {shape.feature_dim} features, memory: {code(shape.history)}",
+        "linear probe": f"error of {probe} of a standard deviation, on held-out episodes" if probe else "not measured",
+        "made by": f"vd4rl-pomdp {one_line(record.version)}{commit}",
+    } | ({"licence": code(license)} if license else {})
     tags = dict.fromkeys([*TAGS, card.method, card.task, card.corruption["corruption"]])
     values: dict[str, Any] = {"license": license} if license else {}
     values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0]}
@@ -179,8 +199,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
             "",
             "| | |",
             "|---|---|",
-            *(f"| {name} | {value} |" for name, value in _facts(record)),
-            *([f"| licence | {code(license)} |"] if license else []),
+            *(f"| {name} | {value} |" for name, value in facts.items()),
             "",
             "## Use it",
             "",
@@ -200,26 +219,3 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
 def front_matter(values: dict[str, Any]) -> list[str]:
     """YAML, its texts as JSON has them, which is YAML, too."""
     return ["---", *(f"{name}: {json.dumps(value)}" for name, value in values.items()), "---"]
-
-
-def _facts(record: EncoderRecord) -> Iterator[tuple[str, str]]:
-    card, shape = record.pretrain, record.encoder
-    yield "method", code(card.method)
-    yield "task, quality", f"{code(card.task)}, {code(card.quality)}"
-    yield "data", f"fingerprint {code(card.data)}" if card.data else "not recorded"
-    yield "corruption", code(json.dumps(card.corruption))
-    frames = f", {record.frames:,} frames" if record.frames else ""
-    if card.end_to_end:
-        yield "budget", f"no pretraining: {code(card.end_to_end)} trains it with the policy"
-    elif record.frames == 0:
-        yield "budget", "none: it is not trained"
-    else:
-        yield "budget", f"preset {code(card.preset)}, {card.steps:,} gradient steps{frames}"
-    yield "seed", str(card.seed)
-    yield "encoder", f"{code(shape.frame_encoder)}, {shape.feature_dim} features, memory: {code(shape.history)}"
-    told = ", ".join(f"{name.removeprefix('probe_')} {error:.1f}%" for name, error in record.probe.items())
-    yield "linear probe", f"error of {told} of a standard deviation, on held-out episodes" if told else "not measured"
-    yield (
-        "made by",
-        f"vd4rl-pomdp {one_line(record.version)}" + (f", commit {code(record.commit)}" if record.commit else ""),
-    )

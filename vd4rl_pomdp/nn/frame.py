@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.core.compiling import compiled_on_gpu
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.options import Limits, Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, draw_normals
@@ -103,46 +103,34 @@ def _features(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
     return encoder.from_maps(_maps.__wrapped__(encoder, obs, dtype))
 
 
+def _rectified(channels: int, *shapes: tuple[int, int, int]) -> list[nn.Module]:
+    """Rectified convolutions by output channels, extent and stride."""
+    layers: list[nn.Module] = []
+    for width, extent, stride in shapes:
+        layers += [nn.Conv2d(channels, width, extent, stride=stride), nn.ReLU()]
+        channels = width
+    return layers
+
+
 def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Four 3x3 convolutions of 32 channels, the first with stride 2 (Kostrikov et al. 2020; used by V-D4RL)."""
-    layers: list[nn.Module] = [nn.Conv2d(channels, 32, 3, stride=2), nn.ReLU()]
-    for _ in range(3):
-        layers += [nn.Conv2d(32, 32, 3), nn.ReLU()]
-    return nn.Sequential(*layers)
+    return nn.Sequential(*_rectified(channels, (32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)))
 
 
 def _nature(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Three convolutions, two of them strided (Mnih et al. 2015): a fraction of DrQ's cost."""
-    return _three_convolutions(nn.Conv2d(channels, 32, 8, stride=4))
+    return nn.Sequential(*_rectified(channels, (32, 8, 4), (64, 4, 2), (64, 3, 1)))
 
 
 def _nature_half(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """The same at half the resolution: means over 2x2 pixels, which a first convolution of half the extent reads."""
     half = nn.AvgPool2d(2, ceil_mode=True)
-    return nn.Sequential(half, *_three_convolutions(nn.Conv2d(channels, 32, 4, stride=2)))
-
-
-def _three_convolutions(first: nn.Conv2d) -> nn.Sequential:
-    return nn.Sequential(
-        first,
-        nn.ReLU(),
-        nn.Conv2d(32, 64, 4, stride=2),
-        nn.ReLU(),
-        nn.Conv2d(64, 64, 3),
-        nn.ReLU(),
-    )
+    return nn.Sequential(half, *_rectified(channels, (32, 4, 2), (64, 4, 2), (64, 3, 1)))
 
 
 def _small(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Three strided convolutions of 16 to 32 channels, for grey 50x50 pictures on a CPU."""
-    return nn.Sequential(
-        nn.Conv2d(channels, 16, 5, stride=2),
-        nn.ReLU(),
-        nn.Conv2d(16, 32, 3, stride=2),
-        nn.ReLU(),
-        nn.Conv2d(32, 32, 3, stride=2),
-        nn.ReLU(),
-    )
+    return nn.Sequential(*_rectified(channels, (16, 5, 2), (32, 3, 2), (32, 3, 2)))
 
 
 _PATCH, _MIXER_DIM, _MIXER_LAYERS = 10, 256, 8
@@ -322,14 +310,28 @@ class StateFrame(nn.Module):
         return state[..., None, None]
 
 
-def make_frame_encoder(name: str, channels: int, size: int, options: FrameOptions) -> FrameEncoder:
-    """Build a frame encoder by name; an unknown name, or one whose module makes no maps, raises UserError."""
-    maps = FRAME_ENCODERS.named(name).build(channels, size, options)
-    if not isinstance(maps, nn.Module):
+def make_frame_encoder(name: str, channels: int, size: int, settings: Mapping[str, Any]) -> FrameEncoder:
+    """Build a frame encoder by name for pictures (channels, size, size), with values of its options.
+
+    Raises:
+        UserError: an unknown name or option, a module that makes no maps, or cannot read pictures of this size.
+    """
+    part = FRAME_ENCODERS.named(name)
+    options = part.options.fill(settings)
+    if unknown := settings.keys() - vars(options).keys():
+        raise UserError(f"frame encoder {name!r} has no option {min(unknown)!r}")
+    try:
+        maps = part.build(channels, size, options)
+        if not isinstance(maps, nn.Module):
+            raise UserError(
+                f"frame encoder {name!r} builds a {type(maps).__name__}, not a module: return what makes the maps"
+            )
+        encoder = FrameEncoder(maps, channels, size, options.feature_dim)
+    except RuntimeError as error:
         raise UserError(
-            f"frame encoder {name!r} builds a {type(maps).__name__}, not a module: return what makes the maps"
-        )
-    encoder = FrameEncoder(maps, channels, size, options.feature_dim)
+            f"frame encoder {name!r} cannot read pictures of {size}x{size} pixels ({first_line(error)}): choose "
+            "another --frame-encoder, or a set of larger frames"
+        ) from error
     if len(encoder.map_shape) != 3:
         raise UserError(
             f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N pictures, not maps (N, C', H', W'): "

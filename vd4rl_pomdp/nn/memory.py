@@ -16,9 +16,7 @@ from torch.nn.functional import pad
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import refuse_options
 from vd4rl_pomdp.core.registry import Registry
-from vd4rl_pomdp.nn.memories.base import Memory, MemoryOptions
-from vd4rl_pomdp.nn.memories.gru import GRU, GRUOptions
-from vd4rl_pomdp.nn.memories.integrator import Integrator
+from vd4rl_pomdp.nn.memories.base import GRU, GRUOptions, Integrator, Memory, MemoryOptions
 from vd4rl_pomdp.nn.memories.lru import LRU, LRUOptions
 from vd4rl_pomdp.nn.memories.transformer import Transformer, TransformerOptions
 

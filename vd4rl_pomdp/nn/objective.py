@@ -165,21 +165,16 @@ class InverseObjective(Objective):
         means = sums[0] / sums[1].clamp(min=1)
         logs = {"action_loss": total.detach()} | {f"loss_k{k:02d}": means[k] for k in gaps}
         if self.predictor is not None:
-            term = self._self_prediction(past, pairs, real)
+            t, k = pairs.unbind(1)
+            gap = (k / self.options.largest_gap).to(past).expand(past.shape[0], -1)[..., None]
+            predicted = self.predictor(torch.cat([past[:, t], gap], dim=-1))
+            term = _mean_over(real, (predicted - past[:, t + k].detach()).square().mean(-1))
             total, logs["self_prediction"] = total + self.options.self_prediction * term, term.detach()
         if self.options.l2_states:
             term = _mean_over(window.real, past.square().mean(-1))
             total, logs["l2_states"] = total + self.options.l2_states * (1 - progress) * term, term.detach()
         logs["loss"] = total.detach()
         return total, logs
-
-    def _self_prediction(self, past: Tensor, pairs: Tensor, real: Tensor) -> Tensor:
-        assert self.predictor is not None
-        t, k = pairs.unbind(1)
-        gap = (k / self.options.largest_gap).to(past).expand(past.shape[0], -1)[..., None]
-        predicted = self.predictor(torch.cat([past[:, t], gap], dim=-1))
-        error = (predicted - past[:, t + k].detach()).square().mean(-1)
-        return _mean_over(real, error)
 
 
 class StateInverse(InverseObjective):

@@ -11,11 +11,12 @@ from torch import Tensor, nn
 from torch.random import fork_rng
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line
-from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metadata
+from vd4rl_pomdp.core.reading import damaged, read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 
 _WEIGHTS, _SHAPE = "model.safetensors", "config.json"
+_NO_POLICY = "not a policy folder", "`vd4rl-pomdp finetune` writes one as RUN/policy"
 _STEP = "step"
 """Metadata of the weights' file."""
 
@@ -82,21 +83,12 @@ def load_policy(folder: Path | str) -> Policy:
             policy = Policy(**read_json(folder / _SHAPE))
         policy.load_state_dict(read_tensors(folder / _WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
-        raise _no_policy(folder, error) from error
+        raise UserError(f"{folder}: {_NO_POLICY[0]} ({first_line(error)}); {_NO_POLICY[1]}") from error
     return policy.eval().requires_grad_(False)
 
 
 def policy_step(folder: Path) -> int | None:
     """The training step of a policy folder's weights, None if they do not tell it; UserError as `load_policy`."""
-    try:
+    with damaged(folder, *_NO_POLICY):
         told = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
         return None if told is None else int(told)
-    except UserError:
-        raise
-    except (FileNotFoundError, ValueError, TypeError) as error:
-        raise _no_policy(folder, error) from error
-
-
-def _no_policy(folder: Path, error: Exception) -> UserError:
-    reason = first_line(error)
-    return UserError(f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy")

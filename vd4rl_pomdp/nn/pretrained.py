@@ -59,13 +59,12 @@ class Pretrained(nn.Module):
         """See the class."""
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
         frames = (frames + 0.5 - self.mean) / self.std
-        features = torch.cat([self._features(part) for part in frames.split(AT_ONCE)])
-        return features.reshape(len(image), -1, 1, 1)
-
-    def _features(self, frames: Tensor) -> Tensor:
-        told = self._model[0](frames)
-        pooled = getattr(told, "pooler_output", None)
-        return (told.last_hidden_state[:, 0] if pooled is None else pooled).flatten(1)
+        features = []
+        for part in frames.split(AT_ONCE):
+            told = self._model[0](part)
+            pooled = getattr(told, "pooler_output", None)
+            features.append((told.last_hidden_state[:, 0] if pooled is None else pooled).flatten(1))
+        return torch.cat(features).reshape(len(image), -1, 1, 1)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self._model[0]._apply(fn)  # it goes to a device, or another precision, with what it is no part of

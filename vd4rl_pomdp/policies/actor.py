@@ -56,7 +56,11 @@ class Actor:
         Returns:
             (A,) float32 in [-1, 1].
         """
-        hidden = self._features(self._standardised(state.astype(np.float64)))
+        state = state.astype(np.float64)
+        if "observation.mean" in self.weights:
+            scaled = (state - self._double["observation.mean"]) / self._double["observation.std"]
+            state = np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+        hidden = self._features(state)
         action = self._linear("mean", hidden)
         if rng is not None:
             log_std = np.clip(self._linear("log_std", hidden), *LOG_STD_RANGE)
@@ -67,12 +71,6 @@ class Actor:
     def _double(self) -> dict[str, np.ndarray]:
         """The weights in double precision."""
         return {name: value.astype(np.float64) for name, value in self.weights.items()}
-
-    def _standardised(self, state: np.ndarray) -> np.ndarray:
-        if "observation.mean" not in self.weights:
-            return state
-        scaled = (state - self._double["observation.mean"]) / self._double["observation.std"]
-        return np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
     def _features(self, x: np.ndarray) -> np.ndarray:
         """Inputs of the two last layers, for the mean and for the standard deviation."""

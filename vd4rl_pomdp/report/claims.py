@@ -7,10 +7,13 @@ like settings are compared.
 
 Claims of a family (results/protocol.md names two) are tested together: Holm's method adjusts their p values over the
 family's claims that are measured in a setting. All others are exploratory and judged by themselves.
+
+`leads` holds MIK+A's lead against the budget of pretraining: does a larger one bring what a smaller one does not?
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
@@ -34,8 +37,7 @@ from vd4rl_pomdp.report.gates import (
     sides,
 )
 from vd4rl_pomdp.report.load import REFERENCES, Run, label
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
@@ -156,20 +158,13 @@ def _row(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tuple[R
     for prefix in ("", "clean_"):
         above, (low, high) = difference(compared, clean=bool(prefix))
         row |= {f"{prefix}difference": above, f"{prefix}low": low, f"{prefix}high": high}
-    return row | _test(compared), compared
-
-
-def _test(compared: Sides) -> Row:
-    """How sure a difference is: its p value, and the smallest that would be found."""
     found = None if compared.unlike else stats.difference(episodes_of(compared.left), episodes_of(compared.right))
     data = [run.reference.data_return for run in (*compared.left, *compared.right)]
-    known = [value for value in data if value is not None]
-    mean = float(np.mean(known)) if len(known) == len(data) else None
+    mean = None if None in data else float(np.mean(data))  # type: ignore[arg-type]
     smallest = found and found.smallest
-    return {
-        **{"p": found and found.p, "adjusted_p": None, "smallest": smallest, "data_return": mean},
-        "smallest_share": smallest / mean if smallest and mean and mean > 0 else None,
-    }
+    row |= {"p": found and found.p, "adjusted_p": None, "smallest": smallest, "data_return": mean}
+    row["smallest_share"] = smallest / mean if smallest and mean and mean > 0 else None
+    return row, compared
 
 
 def _decisive(left: list[Run], others: list[Run]) -> Sides:
@@ -221,3 +216,59 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
     sign = HOLDS if row["difference"] > 0 else FAILS
     found = FEW if p is None else sign if p < stats.LEVEL else OPEN
     return NOT_REFUTED if found == OPEN and row["kind"] == "not below" else found
+
+
+LEADER, OTHER = "mik+a", "acro"
+OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}
+"""What stands against it, by the differences' names: the other method's `--history`."""
+
+
+def leads(runs: list[Run]) -> list[Row]:
+    """One row for every setting, policy's budget, difference and pretraining's budget.
+
+    Only where these methods have at least two budgets of pretraining, and each a run. `difference` is the leader's mean
+    return less the other method's, every run's in % of the mean return of its own data; `low` and `high` are the ends
+    of its 95% interval over seeds and episodes. It is of runs of like settings; where there are none, it is None.
+    `left_seeds` and `right_seeds` count both sides' seeds, whether they can be compared or not.
+
+    A policy's budget are `updates` and `units` of a hidden layer, a pretraining's `steps` and `stacks` in a batch.
+    """
+    finished = [run for run in comparable(runs) if (run.reference.data_return or 0) > 0]
+    sides_of = [as_it_is(LEADER, finished), *(as_it_is(OTHER, finished, history) for history in OTHERS.values())]
+    known = []
+    for run in (run for side in sides_of for run in side):
+        own, card = run.record["config"], run.result.card
+        before = card.get("settings") or {}
+        if {"updates", "hidden_dim"} <= own.keys() and "steps" in card and {"batch_size", "window"} <= before.keys():
+            pretraining = card["steps"], before["batch_size"] * before["window"]
+            known.append((run, (own["updates"], own["hidden_dim"]), pretraining))
+    rows: list[Row] = []
+    for (place, (updates, units)), here in sorted(groups(known, lambda one: (one[0].of(GATED), one[1])).items()):
+        by_budget, everyone = groups(here, lambda one: one[2]), [run for run, *_ in here]
+        for name, history in OTHERS.items():
+            if len(by_budget) < 2 or not (as_it_is(LEADER, everyone) and as_it_is(OTHER, everyone, history)):
+                continue
+            for steps, stacks in sorted(by_budget, key=math.prod):
+                row = dict(zip(GATED, place, strict=True)) | {"method": name, "variant": "", "updates": updates}
+                row |= {"units": units, "steps": steps, "stacks": stacks}
+                rows.append(row | _lead([run for run, *_ in by_budget[steps, stacks]], history))
+    if len({(row["updates"], row["units"]) for row in rows}) > 1:
+        for row in rows:
+            row["variant"] = f"{row['updates']:,} updates of {row['units']:,} units"
+    return rows
+
+
+def _lead(runs: list[Run], history: str) -> Row:
+    """The difference among runs of one budget."""
+    both = as_it_is(LEADER, runs), as_it_is(OTHER, runs, history)
+    compared = sides(*both)
+    difference, ends = None, None
+    if compared.left and not compared.unlike:
+        both = compared.left, compared.right
+        data = (np.array([[run.reference.data_return] for run in side], dtype=float) for side in both)
+        left, right = (100 * episodes_of(side) / known for side, known in zip(both, data, strict=True))
+        difference, ends = float(left.mean() - right.mean()), stats.difference_interval(left, right)
+    low, high = ends or (None, None)
+    seeds = [len({run.labels["seed"] for run in side}) for side in both]
+    row: Row = {"difference": difference, "low": low, "high": high}
+    return row | {"seeds": 0 if difference is None else min(seeds), "left_seeds": seeds[0], "right_seeds": seeds[1]}

@@ -18,8 +18,7 @@ from vd4rl_pomdp.report.load import CONDITION, SETTING, Run, label, load_runs, s
 from vd4rl_pomdp.report.page import made_with
 from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.results import certificates_of
 
@@ -29,22 +28,12 @@ Conditions = dict[tuple, list[Run]]
 """Finished runs by the values of CONDITION."""
 
 
-class Side(NamedTuple):
-    """One of the two result sets."""
-
-    path: Path
-    finished: int
-    """Runs with scores."""
-    others: int
-    """Unfinished and diverged runs, of which no score is compared."""
-    made: str
-    """Commits and machines."""
-
-
 class SideBySide(NamedTuple):
     """Two result sets side by side."""
 
-    sides: tuple[Side, Side]
+    sides: list[Row]
+    """Of each its `path`, how many runs `finished`, how many `others` are not compared, and what they were `made` with:
+    commits and machines."""
     rows: list[Row]
     """One a condition: scores with intervals and n of both, difference with interval, settings that differ, and what is
     certified of memory."""
@@ -67,16 +56,16 @@ def compare_results(one: Path, other: Path) -> SideBySide:
     rows = [_row(key, runs, second.get(partners.get(key, ()), [])) for key, runs in first.items()]
     rows += [_row(key, [], runs) for key, runs in second.items() if key not in partners.values()]
     rows = [row | {"memory": memory[tuple(row[name] for name in SETTING)]} for row in rows]
-    return SideBySide((mine, theirs), sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
+    return SideBySide([mine, theirs], sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
 
 
-def _loaded(path: Path) -> tuple[Side, Conditions]:
+def _loaded(path: Path) -> tuple[Row, Conditions]:
     runs = [run for run in load_runs([path]) if run.stage == "finetune"]
     finished = [run for run in runs if run.evaluated]
     if not finished:
         raise UserError(f"{path}: holds no finished and evaluated run to compare")
-    side = Side(path, len(finished), len(runs) - len(finished), made_with(finished))
-    return side, groups(finished, lambda run: run.of(CONDITION))
+    counts = {"finished": len(finished), "others": len(runs) - len(finished)}
+    return {"path": path, **counts, "made": made_with(finished)}, groups(finished, lambda run: run.of(CONDITION))
 
 
 def _partners(first: Conditions, second: Conditions) -> dict[tuple, tuple]:
@@ -127,16 +116,12 @@ def _differing(one: list[Run], other: list[Run]) -> str:
     return ", ".join(told)
 
 
-def _told(row: Row) -> str:
-    if not row["seeds_a"] or not row["seeds_b"]:
-        return f"only in {'A' if row['seeds_a'] else 'B'}"
-    return row["settings"] or "the same"
-
-
 _COLUMNS: Columns = {
     "setting": setting,
     "method": label,
-    "settings, A → B": _told,
+    "settings, A → B": lambda row: (
+        row["settings"] or "the same" if row["seeds_a"] and row["seeds_b"] else f"only in {'AB'[not row['seeds_a']]}"
+    ),
     "A": ("score_a", "low_a", "high_a", 1),
     "B": ("score_b", "low_b", "high_b", 1),
     "B – A": ("difference", "low", "high", 1),
@@ -148,8 +133,10 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
     """The comparison on the terminal, one table a setting; what differs stands under the method's label."""
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
-        others = f", {side.others} unfinished or diverged" if side.others else ""
-        console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
+        others = f", {side['others']} unfinished or diverged" if side["others"] else ""
+        console.print(
+            f"{name}: {side['path']}, {side['finished']} finished runs{others}", markup=False, highlight=False
+        )
     shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
     method = shown["method"] + "\n  " + shown.pop("settings, A → B")
     for place, part in shown.assign(method=method).groupby("setting", sort=False):

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import base64
 import io
-import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.reading import damaged, read_bytes
 from vd4rl_pomdp.report.load import CONDITION, Run, title
 from vd4rl_pomdp.runs import FILM_FILE
+from vd4rl_pomdp.runs.files import Row
 
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their axes."""
@@ -28,36 +25,22 @@ MOST_BYTES = 5 * 2**20
 Film = dict[str, np.ndarray]
 
 
-class ShownFilm(NamedTuple):
-    """A film as the page carries it."""
-
-    title: str
-    strip: str
-    """PNG in base64."""
-    movie: str
-    """Animated WebP in base64."""
-    share: float
-    """Of the page's width that the strip takes."""
-    total: float
-    """Return of the episode."""
-
-
 def read_film(path: Path) -> Film:
     """Pictures of an evaluation episode; raises UserError for a damaged file."""
-    try:
+    with damaged(path, "cannot be read", "remove it, and the report goes without"):
         with np.load(io.BytesIO(read_bytes(path))) as file:
             film = dict(file)
         if [film[name].ndim for name in FILM] != list(FILM.values()):
             raise ValueError("its arrays have other shapes")
         return film
-    except UserError:
-        raise
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
-        raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
-def shown_films(runs: Iterable[Run]) -> tuple[list[ShownFilm], int]:
-    """The film of the first seed of every method and setting, each read once, and how many found no room."""
+def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:
+    """The film of the first seed of every method and setting, each read once, and how many found no room.
+
+    `title`; in base64 `strip`, a PNG, and `movie`, an animated WebP; `share` of the page's width that the strip takes;
+    `total`, the episode's return.
+    """
     chosen: dict[tuple, Run] = {}
     for run in runs:
         if run.rows and run.result.folder and (run.path / FILM_FILE).exists():
@@ -65,14 +48,12 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[ShownFilm], int]:
     shown, size = [], 0
     for run in chosen.values():
         film = read_film(run.path / FILM_FILE)
-        name = f"{title(run)}, seed {run.labels['seed']}"
         still, moving = (base64.b64encode(picture).decode() for picture in (strip(film), movie(film)))
-        share = min(1.0, len(film["clean"]) / STRIP_FRAMES)
-        made = ShownFilm(name, still, moving, share, film["return"][-1])
-        size += len(made.strip) + len(made.movie)  # all of it is in the page, which has to open from disk
+        size += len(still) + len(moving)  # all of it is in the page, which has to open from disk
         if size > MOST_BYTES:
             break
-        shown.append(made)
+        made: Row = {"title": f"{title(run)}, seed {run.labels['seed']}", "strip": still, "movie": moving}
+        shown.append(made | {"share": min(1.0, len(film["clean"]) / STRIP_FRAMES), "total": film["return"][-1]})
     return shown, len(chosen) - len(shown)
 
 

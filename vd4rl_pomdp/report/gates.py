@@ -18,12 +18,21 @@ from vd4rl_pomdp.core.errors import told_apart
 from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, a_set_a_seed
+from vd4rl_pomdp.report.load import (
+    DATA,
+    ENCODER_SEED,
+    PLAIN,
+    PRESETS,
+    REFERENCES,
+    SETTING,
+    STATE,
+    Run,
+    a_set_a_seed,
+    of_corruption,
+)
 from vd4rl_pomdp.report.stats import interval
-from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, groups, of_corruption
-from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, in_words
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
+from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words
 
 STATE_SHARE = 0.9
 """Least share of the data's mean return, of `state`."""
@@ -70,7 +79,7 @@ def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple
     found = {}
     for place, mine in groups((run for run in runs if run.rows), lambda run: run.of(SETTING)).items():
         names = dict.fromkeys(run.result.certificate for run in mine)
-        told = (in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
+        told = (certificate_in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
         found[place] = "; ".join(dict.fromkeys(told))
     return found
 

@@ -2,13 +2,18 @@
 
 A number of a table goes this way: rows of `episodes.csv` (`runs.results`), a `Run`, `runs_frame` or
 `episodes_frame`, a group-by in `report.tables`.
+
+Variants of a method are told by the settings that differ among its runs, in words that stand beside the method's name:
+runs are seeds of one experiment only if they agree in everything but seed, folders, device and logging. A fine-tuning
+run has its own config, its encoder's, and the data of both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +21,15 @@ import numpy as np
 import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import LABELS, LATER, settings_of
+from vd4rl_pomdp.core.reading import damaged
+from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.data.reference import Reference, summarise
-from vd4rl_pomdp.report.variants import (
-    DATA,
-    OF_CORRUPTION,
-    Parts,
-    Settings,
-    differences,
-    groups,
-    of_corruption,
-    read_settings,
-    without,
-    without_sets,
-)
 from vd4rl_pomdp.runs import REFERENCE_FILE
 from vd4rl_pomdp.runs.critic import CONVERGED
 from vd4rl_pomdp.runs.episodes import COLUMNS
-from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.runs.results import Result, find_results, whole_files
+from vd4rl_pomdp.runs.files import Row, groups
+from vd4rl_pomdp.runs.results import DAMAGED, Result, find_results
 
 SETTING = ("task", "quality", "corruption")
 """Columns of what methods are compared in."""
@@ -50,12 +46,45 @@ ACTION_ERRORS = ("path_error", "action_error")
 """Of a policy, on the data's rows and in closed loop."""
 CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
 """Columns that tell of the last evaluation, also as `clean_` under no corruption, and what `summarise` calls them."""
+MISSING = "missing"
+STATE = "state"
+"""The method that sees the simulator's state, whatever a setting hides."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
 TOLD_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
 """Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
-REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
+REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, STATE)
 """Methods that are references, floors and ceilings: last in a table."""
+
+Settings = dict[str, str]
+"""Values as words, by the name that is shown beside them."""
+Parts = tuple[str, str]
+"""What differs among all runs of a method, and of the data among those of one setting."""
+
+_UNSET = "unset"
+PRESETS = ("preset", "pretraining preset")
+DATA = ("data", "pretraining data")
+"""Names of the sets' fingerprints."""
+OF_CORRUPTION = "corruption "
+"""What the names of a corruption's settings begin with: other parts may have options of the same names."""
+ENCODER_SEED = "pretraining seed"
+"""The seed of a run's encoder, where the run's own is another: its seeds share what they were pretrained with."""
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+PLAIN = {
+    **{"history": "method", "random_histories": "0", "history_window": "0", "readout": "state"},
+    **{"pose_noise": "0", "velocity_noise": "0"},
+    **{name: _words(value) for name, value in LATER.items()},
+}
+"""Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
 
 
 class Choice:
@@ -231,7 +260,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
 
 def _load(result: Result) -> Run:
     """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
-    with whole_files(result.place):
+    with damaged(result.place, *DAMAGED):
         probe, stored = result.files.get("probe", {}), result.files.get("reference")
         critic = result.files.get("critic", {})
         told = {
@@ -276,6 +305,97 @@ def _told_apart(runs: list[Run]) -> list[Run]:
         replace(run, labels=run.labels | {"corruption": corruption}, parts=(of_method, of_set))
         for run, corruption, of_method, of_set in zip(runs, corruptions, of_methods, of_data, strict=True)
     ]
+
+
+def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
+    """All settings behind a run, those of a corruption with OF_CORRUPTION before their names.
+
+    Args:
+        record: its config.json.
+        card: its encoder's card, empty for a pretraining run or where there is none.
+    """
+    own, hiding = settings_of(record["config"]), dict(card.get("corruption", {}))
+    if record["stage"] == "pretrain":
+        hiding = {name: own[name] for name in corruption_settings(str(own.get("corruption"))) if name in own}
+        own = without(own, hiding)
+    before = {name: card[name] for name in ("steps", "preset") if name in card} | (card.get("settings") or {})
+    found = own | {(f"pretraining {k}" if k in own else k): v for k, v in without(before, hiding).items()}
+    found |= {OF_CORRUPTION + name: value for name, value in hiding.items()}
+    found |= {"format": record["format"]} if "format" in record else {}
+    words = {name: _words(value) for name, value in found.items() if name not in ("method", "task", "quality")}
+    if card.get("seed", record["config"]["seed"]) != record["config"]["seed"]:
+        words[ENCODER_SEED] = str(card["seed"])
+    data, first = record.get("inputs", {}).get("data"), card.get("data")
+    prints = zip(DATA, (data, "the same" if data and first == data else first), strict=True)
+    return words | {name: value[:8] for name, value in prints if value}
+
+
+def of_corruption(settings: Settings) -> Settings:
+    """Those of some settings that are a corruption's."""
+    return {name: value for name, value in settings.items() if name.startswith(OF_CORRUPTION)}
+
+
+def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Settings but those of some names."""
+    return {name: value for name, value in settings.items() if name not in names}
+
+
+def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
+    """Settings but those that go by the set, such as a budget: runs on one set agree in them, and the sets differ.
+
+    Args:
+        settings: of every run.
+        sets: task and quality of every run.
+        alike: what runs share that are looked at together.
+    """
+    # A task's own budget is no ablation: as a variant it would make two methods of one, and gaps on every other task.
+    kept = [dict(one) for one in settings]
+    for places in groups(range(len(settings)), alike.__getitem__).values():
+        for name in {name for i in places for name in settings[i]} - {ENCODER_SEED, *DATA}:
+            having = groups((i for i in places if name in settings[i]), sets.__getitem__)
+            values = [{settings[i][name] for i in mine} for mine in having.values()]
+            if all(len(found) == 1 for found in values) and len(set().union(*values)) > 1:
+                for i in places:
+                    kept[i].pop(name, None)
+    return kept
+
+
+def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list[str]:
+    """What differs of each run's settings among those that are alike, in words; nothing where none are recorded."""
+    words = [""] * len(settings)
+    for places in groups((i for i, own in enumerate(settings) if own), alike.__getitem__).values():
+        for i, told in zip(places, _differences([settings[i] for i in places]), strict=True):
+            words[i] = told
+    return words
+
+
+def _differences(settings: Sequence[Settings]) -> list[str]:
+    """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
+
+    ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder. A preset is
+    named in place of the settings that it decides.
+    """
+    names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
+    columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in settings] for name in names}
+    columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
+    # An option of a chosen part is not there without the part: naming the part says it all.
+    everywhere = [name for name, column in columns.items() if _UNSET not in column]
+    columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
+    presets: list[str] = []
+    for name in PRESETS:
+        if name in columns and not _decided(name, columns, presets):
+            presets.append(name)
+    columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}
+    told = [{name: column[i] for name, column in columns.items()} for i in range(len(settings))]
+    for own, one in zip(told, settings, strict=True):
+        own |= {name: value for name, value in one.items() if name == ENCODER_SEED}
+    return [", ".join(f"{name} {value}" for name, value in own.items() if value != PLAIN.get(name)) for own in told]
+
+
+def _decided(name: str, columns: Mapping[str, list[str]], by: Sequence[str]) -> bool:
+    """Whether a setting has the same value wherever others, of which it is none, have the same."""
+    deciding = list(zip(*(columns[other] for other in by), strict=True)) or [()] * len(columns[name])
+    return name not in by and len(set(zip(deciding, columns[name], strict=True))) == len(set(deciding))
 
 
 def a_set_a_seed(runs: Sequence[Run]) -> bool:
@@ -335,3 +455,59 @@ def _run_row(run: Run) -> Row:
         summed = summarise(episodes, run.reference) if episodes else {}
         row |= {prefix + name: summed.get(key) for name, key in CONTROL.items()}
     return row
+
+
+def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
+    """One row for each run that is missing or unfinished: CONDITION, seed and `state`.
+
+    Expected in a setting are all methods of the report with all their variants, each with every seed that any other
+    run has in that setting, and what the choice wants there.
+    """
+    grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
+    rows = []
+    for place, here in groups(grid, lambda run: run.of(SETTING)).items():
+        there = {run.of((*CONDITION, "seed")): run for run in sorted(here, key=attrgetter("evaluated"))}
+        seeds = sorted({run.labels["seed"] for run in here})
+        for method, mine in groups(grid, lambda run: run.of(("algorithm", "method"))).items():
+            for variant in _expected(mine, place):
+                # A seed on the encoder of its own is one of the method, not of the variant that shares it.
+                own = {seed for seed in seeds if f"{ENCODER_SEED} {seed}" in variant.split(", ")}
+                for seed in (seed for seed in seeds if seed not in own):
+                    run = there.get((*place, *method, variant, seed))
+                    if run is None or not run.evaluated:
+                        state = MISSING if run is None or run.finished else run.progress
+                        values = (*place, *method, variant)
+                        rows.append(dict(zip(CONDITION, values, strict=True)) | {"seed": seed, "state": state})
+    rows = [row for row in rows if choice.asks(row)]
+    known = {without_options(row, LABELS) for row in (*(run.labels for run in grid), *rows)}
+    settings = {without_options(run.labels, SETTING): run.labels["corruption"] for run in grid}
+    for row in choice.wanted:  # what was never begun, in settings of any run
+        if without_options(row, LABELS) not in known and without_options(row, SETTING) in settings:
+            named = {name: row.get(name, "") for name in CONDITION}
+            named["corruption"] = settings[without_options(row, SETTING)]
+            rows.append(named | {"seed": row["seed"], "state": MISSING})
+    return rows
+
+
+def _expected(mine: list[Run], setting: tuple[str, ...]) -> Iterator[str]:
+    """Variants of a method that are expected in a setting: those of all settings that share a variant with it.
+
+    Where each setting has variants of its own, such as a budget for every task, nothing is missing; nor is `state`
+    where other pixels of the same set are hidden. Those by data are expected where they are found.
+    """
+    by_setting = groups(mine, lambda run: run.of(SETTING))
+    here = by_setting.get(setting, [])
+    if not here and mine[0].method == STATE and any(there[:2] == setting[:2] for there in by_setting):
+        return
+    own = {run.parts[0] for run in here}
+    shared = [there for there in by_setting.values() if not own or own & {run.parts[0] for run in there}]
+    for variant in dict.fromkeys(run.parts[0] for there in shared for run in there):
+        for data in dict.fromkeys(run.parts[1] for run in here if run.parts[0] == variant) or [""]:
+            yield ", ".join(filter(None, (variant, data)))
+
+
+def gaps_in_words(gaps: Iterable[Row]) -> str:
+    """Gaps of one condition: "seeds 1, 2 missing; seed 3 unfinished at 20 of 40 updates"."""
+    by_state = groups(sorted(gaps, key=lambda row: row["state"]), lambda row: str(row["state"]))
+    told = {state: [str(row["seed"]) for row in members] for state, members in by_state.items()}
+    return "; ".join(f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)} {state}" for state, seeds in told.items())

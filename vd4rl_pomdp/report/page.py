@@ -20,23 +20,29 @@ from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, load, tables
-from vd4rl_pomdp.report.claims import judge_claims, tally
-from vd4rl_pomdp.report.figures import Plot
+from vd4rl_pomdp.report.claims import judge_claims, leads, tally
+from vd4rl_pomdp.report.figures import Plot, draw_plots
 from vd4rl_pomdp.report.films import shown_films
-from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked, verdicts
-from vd4rl_pomdp.report.lead import leads
-from vd4rl_pomdp.report.load import ALL, CONDITION, SETTING, Choice, Run, a_set_a_seed, label, load_runs, title
-from vd4rl_pomdp.report.plots import draw_plots
+from vd4rl_pomdp.report.load import (
+    ALL,
+    CONDITION,
+    SETTING,
+    Choice,
+    Run,
+    a_set_a_seed,
+    find_gaps,
+    label,
+    load_runs,
+    title,
+)
 from vd4rl_pomdp.report.render import block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.shown import MARK, NOTES, SHOWN, WHOLE, Shown, claim_of, shown_tables, with_algorithm
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.theory import load_section
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, keep_certificates
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
-from vd4rl_pomdp.runs.results import RUNS, certificates_of, refuse_loss, write_results
+from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_certificates, refuse_loss, write_results
 
 SEEDS = 12
 """Seeds that are named one by one, at most."""

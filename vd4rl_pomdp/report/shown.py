@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import pandas as pd
@@ -40,26 +40,10 @@ def _count(row: Row) -> str:
     return f"{int(row['seeds'])}" + "†" * (0 < row["seeds"] < FEW_SEEDS)
 
 
-def _side(side: str) -> Callable[[Row], str]:
-    return lambda row: f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})"
-
-
-def _bar(row: Row) -> str:
-    return f"{number(row['acro_bar'], 2)} ({row['bar_from']})"
-
-
-def _converged(row: Row) -> str:
-    return "not recorded" if pd.isna(row["converged"]) else f"{row['converged']:.0f} of {row['seeds']}"
-
-
-def _span(cost: str) -> Callable[[Row], str]:
+def _span(row: Row, cost: str) -> str:
     """Mean, least and most seconds."""
-
-    def told(row: Row) -> str:
-        low, high = row[f"{cost}_min"], row[f"{cost}_max"]
-        return number(row[cost], 0) + (f" ({low:.0f} – {high:.0f})" if low < high else "")
-
-    return told
+    low, high = row[f"{cost}_min"], row[f"{cost}_max"]
+    return number(row[cost], 0) + (f" ({low:.0f} – {high:.0f})" if low < high else "")
 
 
 def _chance(row: Row) -> str:
@@ -97,7 +81,7 @@ SHOWN: dict[str, Columns] = {
         "data's return": ("data_return", 0),
         "state": ("state_share", 2),
         "acro, none": ("acro_share", 2),
-        "its bar": _bar,
+        "its bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
         "best": ("best_share", 2),
         "best – random": ("above_random", "low", "high", 0),
     },
@@ -105,8 +89,8 @@ SHOWN: dict[str, Columns] = {
         "claim": claim_of,
         "setting": setting,
         "verdict": lambda row: row["verdict"] or "–",
-        "left": _side("left"),
-        "right": _side("right"),
+        "left": lambda row: f"{row['left']}: {row['left_return']:.0f} (n = {row['left_seeds']})",
+        "right": lambda row: f"{row['right']}: {row['right_return']:.0f} (n = {row['right_seeds']})",
         "difference": ("difference", "low", "high", 0),
         "p (Holm)": _p,
         "would be found": _smallest,
@@ -178,13 +162,15 @@ SHOWN: dict[str, Columns] = {
         "critic's value": ("critic_value", 1),
         "data's discounted return": ("data_value", 1),
         "moved, %": lambda row: number(100 * row["critic_moved"]),
-        "converged": _converged,
+        "converged": lambda row: (
+            "not recorded" if pd.isna(row["converged"]) else f"{row['converged']:.0f} of {row['seeds']}"
+        ),
     },
     "costs": {
         "method": "method",
         "machines": lambda row: row["machines"] or "not recorded",
-        "pretraining, s": _span(COSTS[0]),
-        "fine-tuning, s": _span(COSTS[1]),
+        "pretraining, s": lambda row: _span(row, COSTS[0]),
+        "fine-tuning, s": lambda row: _span(row, COSTS[1]),
         "runs": "runs",
     },
 }

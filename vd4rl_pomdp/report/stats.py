@@ -51,24 +51,15 @@ def optimality_gap(scores: np.ndarray, target: float = 100.0) -> np.ndarray:
     return target - np.minimum(scores, target).mean(-1)
 
 
-def median_of_tasks(sizes: Sequence[int]) -> Statistic:
-    """Median over tasks of a task's mean, of scores whose last axis holds `sizes` runs of each task in turn."""
-    edges = np.cumsum(sizes)[:-1]
-
-    def median(scores: np.ndarray) -> np.ndarray:
-        return np.median(np.stack([part.mean(-1) for part in np.split(scores, edges, axis=-1)], axis=-1), axis=-1)
-
-    return median
-
-
 def aggregates(strata: Strata) -> dict[str, Statistic]:
     """The statistics of all runs of a method, by name, for scores that hold those of each task in turn."""
-    return {
-        "iqm": iqm,
-        "median": median_of_tasks([len(scores) for scores in strata]),
-        "mean": mean,
-        "optimality_gap": optimality_gap,
-    }
+    edges = np.cumsum([len(scores) for scores in strata])[:-1]
+
+    def median(scores: np.ndarray) -> np.ndarray:
+        """Over tasks, of a task's mean."""
+        return np.median(np.stack([part.mean(-1) for part in np.split(scores, edges, axis=-1)], axis=-1), axis=-1)
+
+    return {"iqm": iqm, "median": median, "mean": mean, "optimality_gap": optimality_gap}
 
 
 def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:

@@ -12,8 +12,18 @@ import numpy as np
 import pandas as pd
 
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.gaps import in_words
-from vd4rl_pomdp.report.load import CONDITION, CONTROL, COSTS, CRITIC, IDENTITY, PROBES, REFERENCES, SETTING, labels
+from vd4rl_pomdp.report.load import (
+    CONDITION,
+    CONTROL,
+    COSTS,
+    CRITIC,
+    IDENTITY,
+    PROBES,
+    REFERENCES,
+    SETTING,
+    gaps_in_words,
+    labels,
+)
 from vd4rl_pomdp.runs.files import Row
 
 SCORE = "Score = return / 10 or the task's own divisor"
@@ -53,7 +63,7 @@ def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tu
     """
     rows = {condition: _scores(seeds) for condition, seeds in evaluated.groupby(list(CONDITION), sort=False)}
     absent = {
-        condition: {"absent": len(seeds), "missing": in_words(seeds.to_dict("records"))}
+        condition: {"absent": len(seeds), "missing": gaps_in_words(seeds.to_dict("records"))}
         for condition, seeds in gaps.groupby(list(CONDITION), sort=False)
     }
     nothing: Row = {"seeds": 0, "episodes": 0, "absent": 0, "missing": ""}
@@ -214,7 +224,7 @@ def representations(table: pd.DataFrame) -> pd.DataFrame:
     """
     means = _means(table[table["score"].notna()], ["action_loss", *PROBES, "return", *COSTS])
     gaps = [
-        (*condition, in_words(seeds[seeds["score"].isna()].to_dict("records")))
+        (*condition, gaps_in_words(seeds[seeds["score"].isna()].to_dict("records")))
         for condition, seeds in table.groupby(list(CONDITION), sort=False)
     ]
     found = pd.DataFrame(gaps, columns=[*CONDITION, "missing"]).merge(means, how="left", on=list(CONDITION))

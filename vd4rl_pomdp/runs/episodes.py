@@ -7,11 +7,10 @@ import io
 import math
 import os
 from pathlib import Path
-from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS
-from vd4rl_pomdp.core.reading import read_bytes, regular
+from vd4rl_pomdp.core.reading import damaged, read_bytes, regular
 from vd4rl_pomdp.runs.files import Row, appending, write_csv
 
 EVALUATION_SEED = 20_000
@@ -67,30 +66,25 @@ def drop_episodes_after(path: Path, step: int) -> None:
 def _parse(path: Path, content: bytes) -> list[Row]:
     if not content:
         return []
-    try:
+    with damaged(path, "a row is not whole", "remove it"):
         if not content.endswith(b"\n"):
             raise ValueError("the last line has no end")
         reader = csv.DictReader(io.StringIO(content.decode(), newline=""))
         if missing := [name for name in COLUMNS if name not in (reader.fieldnames or [])]:
             raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
-        return [_parse_row(path, row) for row in reader]
-    except UserError:
-        raise
-    except (ValueError, TypeError, csv.Error) as error:
-        raise UserError(f"{path}: a row is not whole ({error}); remove it") from error
-
-
-def _parse_row(path: Path, row: dict[str, Any]) -> Row:
-    if None in row or None in row.values() or not row["evaluated_under"]:
-        raise ValueError("it has more cells than there are columns, or fewer")
-    for name in ("return", "score"):
-        if not math.isfinite(value := float(row[name])):
-            raise UserError(
-                f"{path}: the {name} of seed {row['seed']}, step {row['step']}, episode {row['episode']} is {value}; "
-                "its policy has diverged: train it again with a lower --learning-rate, or leave the run out"
-            )
-        row[name] = value
-    error = float(row["action_error"]) if row["action_error"] else None
-    if error is not None and not math.isfinite(error):
-        raise ValueError(f"its action error is {error}")
-    return row | {name: int(row[name]) for name in _WHOLE} | {"action_error": error}
+        rows: list[Row] = []
+        for row in reader:
+            if None in row or None in row.values() or not row["evaluated_under"]:
+                raise ValueError("it has more cells than there are columns, or fewer")
+            numbers = {name: float(row[name]) for name in ("return", "score")}
+            if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
+                raise UserError(
+                    f"{path}: the {bad[0]} of seed {row['seed']}, step {row['step']}, episode {row['episode']} is "
+                    f"{numbers[bad[0]]}; its policy has diverged: train it again with a lower --learning-rate, or "
+                    "leave the run out"
+                )
+            error = float(row["action_error"]) if row["action_error"] else None
+            if error is not None and not math.isfinite(error):
+                raise ValueError(f"its action error is {error}")
+            rows.append(row | numbers | {name: int(row[name]) for name in _WHOLE} | {"action_error": error})
+        return rows

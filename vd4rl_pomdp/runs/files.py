@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import json
 import os
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""
+Member = TypeVar("Member")
+Key = TypeVar("Key", bound=Hashable)
 
 
 def jsonable(value: Any) -> Any:
@@ -30,12 +33,8 @@ def jsonable(value: Any) -> Any:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; raises UserError if it is missing, not readable or damaged."""
-    try:
+    with damaged(path, "cannot be read as JSON"):
         value = parse_json(read_bytes(path))
-    except UserError:
-        raise
-    except (FileNotFoundError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(value, dict):
         raise UserError(f"{path}: holds no JSON object")
     return value
@@ -106,10 +105,8 @@ def appending(path: Path) -> Iterator[IO[str]]:
         UserError: the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
-        with suppress(ImportError, OSError):
-            import fcntl  # not on Windows
-
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX)  # not on every file system
+        with suppress(OSError):  # not on every file system
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX)
         yield file
         file.flush()
         os.fsync(file.fileno())
@@ -143,6 +140,14 @@ def holds_anything(folder: Path) -> bool:
     """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are left by cut commands."""
     with disk_errors(folder):
         return folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir())
+
+
+def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
+    """Members by key, keys in the order in which they first come."""
+    found: dict[Key, list[Member]] = {}
+    for member in members:
+        found.setdefault(key(member), []).append(member)
+    return found
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

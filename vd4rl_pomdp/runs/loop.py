@@ -52,32 +52,6 @@ class Loop:
         """Whether the step just done is one of every so many, or the last."""
         return self._learner.step % every == 0 or self._learner.step == self._total
 
-    def save(self) -> None:
-        """Keep the state after the step just done, and end here if a signal asks for it."""
-        save([self])
-
-    def keep(self) -> None:
-        """Keep the state after the step just done."""
-        step = self._learner.step
-        if step != self._saved:
-            self._run.save(step, {"learner": self._learner.state(), "means": self._means.state_dict()})
-            self._saved = step
-
-    def advance(self) -> bool:
-        """Show that a step was done; whether it is to be kept."""
-        self._progress.advance()
-        return self.due(self._run.config["checkpoint_every"]) or interrupt.asked()
-
-    @property
-    def where(self) -> str:
-        """What is kept, and of which step."""
-        return f"{self._run.path} keeps step {self._learner.step}"
-
-    @property
-    def step(self) -> int:
-        """Steps done."""
-        return self._learner.step
-
     def add(self, logs: dict[str, Tensor]) -> None:
         """Count the scalars of the step just done for the next row of metrics."""
         self._means.add(logs)
@@ -110,18 +84,23 @@ def in_step(loops: Sequence[Loop], until: int) -> Iterator[int]:
 
     Loops that are taken out meanwhile are left alone.
     """
-    while loops and loops[0].step < until:
-        yield loops[0].step + 1
+    while loops and loops[0]._learner.step < until:
+        yield loops[0]._learner.step + 1
+        for loop in loops:
+            loop._progress.advance()
         # Here alone is a step whole: weights, optimiser and random streams are all of the same step.
-        if any([loop.advance() for loop in loops]):
+        if interrupt.asked() or any(loop.due(loop._run.config["checkpoint_every"]) for loop in loops):
             save(loops)
 
 
 def save(loops: Sequence[Loop]) -> None:
     """Keep the states of all after the step just done, and end here if a signal asks for it."""
     for loop in loops:
-        loop.keep()
-    interrupt.check(", ".join(loop.where for loop in loops))
+        step = loop._learner.step
+        if step != loop._saved:
+            loop._run.save(step, {"learner": loop._learner.state(), "means": loop._means.state_dict()})
+            loop._saved = step
+    interrupt.check(", ".join(f"{loop._run.path} keeps step {loop._learner.step}" for loop in loops))
 
 
 @contextmanager

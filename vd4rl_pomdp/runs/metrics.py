@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError, in_one_line
-from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.files import appending, write_bytes
 from vd4rl_pomdp.runs.run import RunFolder, recipe
@@ -168,19 +168,14 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     """
     if not path.exists():
         return []
-    try:
-        return [_row(line) for line in read_bytes(path).decode().rpartition("\n")[0].splitlines()]
-    except UserError:
-        raise
-    except ValueError as error:
-        raise UserError(f"{path}: a line is not JSON of numbers ({error}); remove the line") from error
-
-
-def _row(line: str) -> dict[str, float]:
-    row = parse_json(line)
-    if not isinstance(row, dict) or "step" not in row or not all(isinstance(v, int | float) for v in row.values()):
-        raise ValueError("it holds no numbers with their step")
-    return row
+    rows, content = list[dict[str, float]](), read_bytes(path)
+    with damaged(path, "a line is not JSON of numbers", "remove the line"):
+        for line in content.decode().rpartition("\n")[0].splitlines():
+            row = parse_json(line)
+            if not (isinstance(row, dict) and "step" in row and all(isinstance(v, int | float) for v in row.values())):
+                raise ValueError("it holds no numbers with their step")
+            rows.append(row)
+    return rows
 
 
 def mirrors_of(
@@ -213,7 +208,10 @@ class Wandb:
         import wandb
 
         folder, online = run.path / "wandb", run.config["wandb"] == "online"
-        name = _wandb_id(folder / "id")
+        if not (folder / "id").exists():  # drawn: two runs of one recipe are two
+            folder.mkdir(parents=True, exist_ok=True)
+            write_bytes(folder / "id", secrets.token_hex(8).encode())
+        name = (folder / "id").read_text(encoding="ascii").strip()
         for earlier in folder.glob(f"offline-run-*-{name}"):  # a killed process leaves files that `wandb sync` refuses
             shutil.rmtree(earlier)
         whole = run.config | dict(labels) | {"stage": run.stage, "inputs": run.inputs}
@@ -260,14 +258,6 @@ def wandb_names(run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, An
     seed = f" seed {run.config['seed']}"
     tags = [tag[: LONGEST["tags"]] for tag in dict.fromkeys([run.stage, *told])]
     return {"group": group, "name": title[: LONGEST["name"] - len(seed)] + seed, "tags": tags}
-
-
-def _wandb_id(file: Path) -> str:
-    """The wandb run of a folder, drawn when it is first asked for: two runs of one recipe are two."""
-    if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(file, secrets.token_hex(8).encode())
-    return file.read_text(encoding="ascii").strip()
 
 
 class TensorBoard:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from vd4rl_pomdp.core.errors import InUseError, UnavailableError, UserError, disk_error, disk_errors
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_error, disk_errors
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import CONFIG_FILE
 from vd4rl_pomdp.runs.interrupt import handled
@@ -90,8 +90,7 @@ def owned(folder: Path) -> Iterator[None]:
     """Own a folder, made if missing, and answer signals as `interrupt` says; the system frees what a killed one owned.
 
     Raises:
-        InUseError: another process owns it, which the message names.
-        UserError: it cannot be written.
+        UserError: another process owns it, which the message names, or it cannot be written.
     """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -100,7 +99,7 @@ def owned(folder: Path) -> Iterator[None]:
             lock.acquire(timeout=_WAIT_S, poll_interval=_WAIT_S / 10)
         except Timeout:
             owner = (folder / LOCK).read_text(encoding="utf-8") or "another process"
-            raise InUseError(f"{folder}: is in use by {owner}; wait until it ends, or choose another folder") from None
+            raise UserError(f"{folder}: is in use by {owner}; wait until it ends, or choose another folder") from None
     try:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         with disk_errors(folder):

@@ -79,14 +79,15 @@ def machine(device: str = "auto") -> dict[str, Any]:
     from vd4rl_pomdp.runs.device import pick_device
 
     used = pick_device(device)
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0  # not on Windows
-    gpu = torch.cuda.get_device_name(used) if used.type == "cuda" else None
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return {
-        "processor": _processor(),
+        "processor": models[0] if models else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "bf16_kernels": torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported(),
-        "memory_gib": round(memory / 2**30, 1),
-        "gpu": gpu,
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": torch.cuda.get_device_name(used) if used.type == "cuda" else None,
         "system": platform.system(),
     }
 
@@ -104,12 +105,3 @@ def command(stage: str = "", words: Sequence[str] | None = None) -> str:
         program = ["vd4rl-pomdp", *([script.parent.name] if script.parent.name in ("pretrain", "finetune") else [])]
     given = sys.argv[1:] if words is None else [*(word for word in sys.argv[1:2] if word == stage), *words]
     return shlex.join([*program, *given])
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()

@@ -1,7 +1,9 @@
 """Results that outlive their run folders: one folder an experiment, small enough to commit.
 
-    runs.jsonl     one JSON object a run: its id, and what its small files hold, by their names
-    episodes.csv   raw evaluation rows, the run's id first
+    runs.jsonl           one JSON object a run: its id, and what its small files hold, by their names
+    episodes.csv         raw evaluation rows, the run's id first
+    certificates.json    whether a set under a corruption needs a memory of what was seen, by ids that name the set's
+                         content and the corruption, as `vd4rl-pomdp certify` found; it lies in the set's folder, too
 
 A report of a results folder is the same as one of the run folders, but for films. Both files are written whole, the
 rows first: rows of a run that runs.jsonl does not name were left by a cut writing, and are ignored.
@@ -12,30 +14,34 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.options import LABELS, settings_of
-from vd4rl_pomdp.core.reading import fits, parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, fits, parse_json, read_bytes
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
-from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates, read_certificates
 from vd4rl_pomdp.runs.critic import TOLD, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, EVALUATION_SEED, episodes_until, read_episodes
-from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
+from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv, write_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.provenance import CONTINUED
-from vd4rl_pomdp.runs.run import identity, remedy
+from vd4rl_pomdp.runs.run import identity, recipe, remedy
 
 RUNS = "runs.jsonl"
 FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
 """A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
 
+CERTIFICATES = "certificates.json"
+NOT_CERTIFIED = "not certified"
+_HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
+DAMAGED = "its files are damaged", "take another copy, or leave it out"
+"""What is said of a run whose files hold something else than a run writes."""
 _ROUNDING = 1e-4
 """Of a score, which is kept to four digits, as its return is."""
 
@@ -78,12 +84,16 @@ class Result:
     @property
     def machine(self) -> str:
         """What it was computed on: its GPU, or its processor and cores; "A then B" if it moved, empty if unknown."""
-        return _in_turn(map(_hardware, self.parts))
+        told = []
+        for part in self.parts:
+            processor, cores = part.get("processor"), part.get("cores")
+            told.append(part.get("gpu") or (f"{processor}, {cores} cores" if processor and cores else processor))
+        return " then ".join(dict.fromkeys(str(one) for one in told if one))
 
     @property
     def commit(self) -> str:
         """The commit it was computed with, likewise."""
-        return _in_turn(part.get("git_commit") for part in self.parts)
+        return " then ".join(dict.fromkeys(str(one) for part in self.parts if (one := part.get("git_commit"))))
 
     @property
     def encoder(self) -> dict[str, Any]:
@@ -92,8 +102,9 @@ class Result:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """What its encoder says of the code that made it, and of its probe; empty where there is none yet."""
-        return self.files.get("encoder", {}).get("origin", {})
+        """What its encoder says of the code that made it, in earlier rows in a part of its own; empty without one."""
+        told = self.files.get("encoder", {})
+        return told.get("origin", told)
 
     @property
     def card(self) -> dict[str, Any]:
@@ -106,9 +117,24 @@ class Result:
         return {name: self.files["labels"][name] for name in LABELS}
 
     @property
+    def data(self) -> str:
+        """Fingerprint of its set, empty where it tells none."""
+        return self.record.get("inputs", {}).get("data", "")
+
+    @cached_property
+    def recipe(self) -> str:
+        """What it computes, but for its data's content."""
+        return recipe(self.record, self.card if {"settings", "seed"} <= self.card.keys() else {})
+
+    @property
+    def on_one_set(self) -> bool:
+        """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
+        return self.card.get("data") in (None, self.data)
+
+    @property
     def certificate(self) -> str:
         """Id of the certificate that would speak of its set and corruption."""
-        return certificate_id(self.record.get("inputs", {}).get("data", ""), self.encoder.get("corruption") or {})
+        return certificate_id(self.data, self.encoder.get("corruption") or {})
 
     @property
     def measured(self) -> list[Row]:
@@ -136,49 +162,39 @@ class Result:
         return self.settled + self.finished
 
 
-def _in_turn(words: Iterable[Any]) -> str:
-    return " then ".join(dict.fromkeys(str(word) for word in words if word))
-
-
-def _hardware(part: dict[str, Any]) -> str | None:
-    if part.get("gpu"):
-        return str(part["gpu"])
-    processor, cores = part.get("processor"), part.get("cores")
-    return f"{processor}, {cores} cores" if processor and cores else processor
+def read_records(folder: Path) -> Result:
+    """A run folder without metrics and rows: what its small files hold; raises UserError for a damaged one."""
+    files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
+        raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
+    return Result("", folder, files, 0, [], [], True)
 
 
 def read_run(folder: Path | str) -> Result:
     """What a run folder holds; raises UserError for damaged files."""
     folder = Path(folder)
-    files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    files = read_records(folder).files
     if "config" not in files:
         raise UserError(f"{folder}: is no run, which has a {CONFIG_FILE}; name a folder that a training wrote")
-    if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
-        raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
     metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
     # A row that was cut with its run is left out; a finished run has none.
     found = read_episodes(path) if "timing" in files else episodes_until(path, sys.maxsize)
     rows = [{name: row[name] for name in COLUMNS} for row in found]
     step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
-    with whole_files(folder):
+    with damaged(folder, *DAMAGED):
         losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
         pretraining = files["config"]["stage"] == "pretrain"
         run = Result("", folder, files, step, losses if pretraining else [], rows, True)
         _check(run)
-        _check_last_evaluation(run)
+        last, episodes = files.get("timing", {}).get("updates"), run.record["config"].get("eval_episodes")
+        played = sum(row["step"] == last and row["evaluated_under"] == row["corruption"] for row in rows)
+        if last is not None and episodes is not None and played < episodes:
+            what = f"{played} of {episodes} episodes of the last evaluation"
+            raise UserError(f"{path}: has {what}; {remedy(folder)}")
         if files.get("critic") == {} and any(VALUE in row for row in metrics):
             raise UserError(f"{folder / CRITIC_FILE}: tells of no critic, {METRICS_FILE} of one; {remedy(folder)}")
         files["labels"] = files.get("labels", {}) | _labels(run)
         return replace(run, id=_id(run))
-
-
-def _check_last_evaluation(run: Result) -> None:
-    """Raise UserError if a finished fine-tuning's folder lacks episodes of its last evaluation."""
-    last, episodes = run.files.get("timing", {}).get("updates"), run.record["config"].get("eval_episodes")
-    found = [row for row in run.rows if row["step"] == last and row["evaluated_under"] == row["corruption"]]
-    if last is not None and episodes is not None and len(found) < episodes:
-        what = f"{len(found)} of {episodes} episodes of the last evaluation"
-        raise UserError(f"{run.path / EPISODES_FILE}: has {what}; {remedy(run.path)}")
 
 
 def _labels(run: Result) -> dict[str, Any]:
@@ -214,37 +230,11 @@ def _check(run: Result) -> None:
         raise TypeError(f"its {CRITIC_FILE} is {critic}")
 
 
-@contextmanager
-def whole_files(where: Path | str) -> Iterator[None]:
-    """Whatever is wrong with a run's content becomes a sentence that says where."""
-    try:
-        yield
-    except UserError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"{where}: its files are damaged ({error}); take another copy, or leave it out") from error
-
-
 def read_results(folder: Path | str) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
     folder = Path(folder)
     path, by_run = folder / RUNS, dict[str, list[Row]]()
-    lines = read_lines(path)  # before the rows, which are written first: one that is written meanwhile lacks none
-    for row in read_episodes(folder / EPISODES_FILE):
-        if "id" not in row:
-            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
-        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
-        shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
-        by_run.setdefault(row["id"], []).append(shared)
-    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
-    if len({run.id for run in runs}) != len(runs):
-        raise UserError(f"{path}: names a run twice; remove one of the two lines")
-    return runs
-
-
-def read_lines(path: Path) -> list[str]:
-    """The lines of a runs.jsonl; raises UserError for one that is missing, empty or no text."""
-    try:
+    try:  # before the rows, which are written first: one that is written meanwhile lacks none
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
         raise UserError(f"{path.parent}: holds no {RUNS}, so it is no results folder") from error
@@ -252,22 +242,29 @@ def read_lines(path: Path) -> list[str]:
         raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
     if not lines:
         raise UserError(f"{path}: is empty; take another copy, or remove it")
-    return lines
-
-
-def _parse(path: Path, number: int, line: str, by_run: dict[str, list[Row]]) -> Result:
-    """A line's run, with the rows that it had when the line was written: a cut writing may have added later ones."""
-    with whole_files(f"{path}: line {number}"):
-        told = parse_json(line)
-        files = {name: told[name] for name in FILES if name in told}
-        losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
-        rows, count = by_run.get(told["id"], []), int(told["episodes"])
-        if len(rows) < count:
-            where = path.parent / EPISODES_FILE
-            raise UserError(f"{where}: has {len(rows)} of {count} rows of run {told['id']}; take another copy")
-        run = Result(told["id"], path.parent, files, int(told["step"]), losses, rows[:count])
-        _check(run)
-        return run
+    for row in read_episodes(folder / EPISODES_FILE):
+        if "id" not in row:
+            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
+        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
+        shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
+        by_run.setdefault(row["id"], []).append(shared)
+    runs: dict[str, Result] = {}
+    for number, line in enumerate(lines, 1):
+        with damaged(f"{path}: line {number}", *DAMAGED):
+            told = parse_json(line)
+            name, count = told["id"], int(told["episodes"])
+            rows = by_run.get(name, [])
+            if name in runs:
+                raise UserError(f"{path}: names a run twice; remove one of the two lines")
+            if len(rows) < count:
+                where = folder / EPISODES_FILE
+                raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; take another copy")
+            files = {key: told[key] for key in FILES if key in told}
+            losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
+            # those that it had when the line was written: a cut writing may have added later ones
+            runs[name] = Result(name, folder, files, int(told["step"]), losses, rows[:count])
+            _check(runs[name])
+    return list(runs.values())
 
 
 def write_results(out: Path, runs: Iterable[Result]) -> None:
@@ -299,64 +296,37 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
-    found: dict[str, Result] = {}
-    for run in _found([Path(path) for path in paths], but):
-        found[run.id] = _better(found[run.id], run) if run.id in found else run
-    if not found:
-        raise UserError(
-            f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
-            f"folder (which holds {RUNS})"
-        )
-    return list(found.values())
-
-
-def _found(paths: Sequence[Path], but: Path | None) -> Iterator[Result]:
-    if missing := [path for path in paths if not path.exists()]:
+    named = [Path(path) for path in paths]
+    if missing := [path for path in named if not path.exists()]:
         raise UserError(f"{missing[0]}: no such folder")
-    files = [file for path in paths for file in files_below(path, CONFIG_FILE)]
-    yield from (read_run(file.parent) for file in dict.fromkeys(files) if "stage" in read_json(file))
+    files = dict.fromkeys(file for path in named for file in files_below(path, CONFIG_FILE))
+    runs = [read_run(file.parent) for file in files if "stage" in read_json(file)]
     places: dict[Path, None] = {}
-    for path in paths:
+    for path in named:
         below = {file.parent for file in files_below(path, RUNS)}
         places |= dict.fromkeys(place for place in sorted(below) if below.isdisjoint(place.parents))
     for place in places:
-        if but is None or place in paths or place.resolve() != but.resolve():
-            yield from read_results(place)
-
-
-def _better(one: Result, other: Result) -> Result:
-    """Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead."""
-    if one.settled and one.ending == other.ending and one.measured != other.measured:
-        raise UserError(f"{other.path} and {one.path}: two runs of one method, setting and seed; name one of them")
-    return max(one, other, key=lambda run: (run.ending, run.folder, len(run.measured), run.step))
-
-
-class Added(NamedTuple):
-    """What became of some runs."""
-
-    added: int
-    known: int
-    """There already with the same rows."""
-    kept: int
-    """There already with other rows, which stay."""
-    unfinished: int
-    """Neither finished nor diverged, so left out."""
-
-    @property
-    def in_words(self) -> str:
-        """One line: "2 runs added, 1 there already"."""
-        told = (
-            (self.known, "there already"),
-            (self.kept, "there already with other rows, which stay (remove their lines to replace them)"),
-            (self.unfinished, "unfinished and left out"),
+        if but is None or place in named or place.resolve() != but.resolve():
+            runs += read_results(place)
+    if not runs:
+        raise UserError(
+            f"{named[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
+            f"folder (which holds {RUNS})"
         )
-        return ", ".join(
-            [f"{self.added} run{'s' * (self.added != 1)} added", *(f"{n} {what}" for n, what in told if n)]
-        )
+    found: dict[str, Result] = {}
+    for run in runs:
+        other = found.setdefault(run.id, run)
+        if other.settled and other.ending == run.ending and other.measured != run.measured:
+            raise UserError(f"{run.path} and {other.path}: two runs of one method, setting and seed; name one of them")
+        # Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead.
+        found[run.id] = max(other, run, key=lambda one: (one.ending, one.folder, len(one.measured), one.step))
+    return list(found.values())
 
 
-def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
-    """Append the runs at or below some paths to a results folder, each once; no row that is there changes.
+def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
+    """Append the runs at or below some paths to a results folder, each once; says what became of them.
+
+    No row that is there changes.
 
     An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled,
     and one that diverged to the same run when it has finished after all.
@@ -376,7 +346,52 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
         keep_certificates(out, certificates_of(found, map(Path, paths), out))
     again = [run for run in settled if run.id not in fresh]
     known = sum(run.measured == there[run.id].measured for run in again)
-    return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
+    told = {
+        "there already": known,
+        "there already with other rows, which stay (remove their lines to replace them)": len(again) - known,
+        "unfinished and left out": len(found) - len(settled),
+    }
+    more = [f"{number} {what}" for what, number in told.items() if number]
+    return ", ".join([f"{len(fresh)} run{'s' * (len(fresh) != 1)} added", *more])
+
+
+def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
+    """Name of what a certificate is about: the set's fingerprint, and the settings of a corruption."""
+    return content_hash([data, dict(corruption)])
+
+
+def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+    """All certificates at or below some folders, by id; of several for one id the newest.
+
+    Args:
+        places: folders.
+        but: a folder whose own file is not read.
+
+    Raises:
+        UserError: a file is damaged.
+    """
+    found: dict[str, Row] = {}
+    for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
+        told = {} if but is not None and file.parent.resolve() == but.resolve() else read_json(file)
+        for name, one in told.items():
+            if not (isinstance(one, dict) and one.keys() >= _HOLDS):
+                raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
+            if name not in found or str(one["made"]) > str(found[name]["made"]):
+                found[name] = one
+    return found
+
+
+def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
+    """Add certificates to a folder's own; those of an id that is there take its place. None: nothing is written."""
+    file = folder / CERTIFICATES
+    there = read_json(file) if file.exists() else {}
+    if there | certificates != there:
+        write_json(file, there | certificates)
+
+
+def certificate_in_words(certificate: Row) -> str:
+    """The verdict and what it rests on."""
+    return f"{certificate['verdict']} ({certificate['why']})"
 
 
 def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
@@ -411,7 +426,7 @@ def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
 
 
 def _contradictions(run: Result) -> Iterator[str]:
-    with whole_files(run.place):
+    with damaged(run.place, *DAMAGED):
         if (computed := _id(run)) != run.id:
             yield f"its record computes {computed}"
         config, card = run.record["config"], run.encoder

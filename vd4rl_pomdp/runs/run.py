@@ -144,12 +144,6 @@ class RunFolder:
         """Whether nothing is there to resume from: what was recorded before tells of nothing."""
         return not (self.finished or self._checkpoints.steps() or (self.path / EPISODES_FILE).exists())
 
-    @property
-    def code(self) -> dict[str, Any]:
-        """What the run began with, once it has: versions, commit, and where parts not of this package come from."""
-        record = read_json(self.path / CONFIG_FILE)
-        return {name: record.get(name, {}) for name in ("versions", "git_commit", "plugins", "sources")}
-
     def _begin(self) -> None:
         """Write what the run begins with, or add to it where what it resumes with is something else."""
         now = {"versions": versions(), "git_commit": git_commit()} | code_of(self._parts)
@@ -161,9 +155,10 @@ class RunFolder:
         if self._begins or not path.exists():  # a start may have been killed between the two files
             write_json(path, hardware)
         else:
-            told = read_json(path)
+            told, began = read_json(path), read_json(self.path / CONFIG_FILE)
             later = told.pop(CONTINUED, [])
-            if (told | self.code | (later[-1] if later else {})) != hardware | now:
+            code = {name: began.get(name, {}) for name in now}  # versions, commit, and where other parts come from
+            if (told | code | (later[-1] if later else {})) != hardware | now:
                 write_json(path, told | {CONTINUED: [*later, hardware | now]})
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
 

@@ -30,9 +30,14 @@ class _Pool:
         self._processes: dict[int, Any] = {}
 
     def map(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
-        with _blocked_signals():
+        # Processes that are started here inherit the mask: Ctrl-C, which a terminal sends to all, is not for them, nor
+        # is the SIGTERM that a cluster sends to a whole group.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
             results = self._executor.map(function, jobs)
             self._processes = dict(self._executor._processes)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return results
 
     def serves(self, workers: int) -> bool:
@@ -111,22 +116,6 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
             _kept.append(pool)
         else:
             pool.close()
-
-
-@contextmanager
-def _blocked_signals() -> Iterator[None]:
-    """Processes that are started in the block inherit the mask: Ctrl-C, which a terminal sends to all, is not for them.
-
-    Nor is the SIGTERM that a cluster sends to a whole group.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def count_workers(workers: int) -> int:

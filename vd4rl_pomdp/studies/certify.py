@@ -35,11 +35,10 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gates import STATE_SHARE, converged, episodes_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.stats import with_interval
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.files import Row, read_json, write_json
+from vd4rl_pomdp.runs.files import Row, groups, read_json, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
+from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.sweeps.grid import GridCell, load_grid
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.stages import COMMANDS, check_cells, recipe_of, recorded, told

@@ -22,10 +22,9 @@ from typing import Any
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, first_line
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.outputs import in_use
-from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, say
+from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, say
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
-from vd4rl_pomdp.sweeps.stacks import in_stacks
 
 LOOK_S = 15.0
 """Seconds between two looks at the cluster."""

@@ -1,7 +1,8 @@
 """Carries out plans on this machine: starts what can be started, retries what can pass, and lets the rest go on.
 
 Whether a job is done, its folder says; so a driver may be killed at any moment, several may work on one folder, and the
-next one goes on with whatever is left.
+next one goes on with whatever is left. One process may do several fine-tunings, as `vd4rl-pomdp finetune WORDS + WORDS`
+does: each stays a job of its own, with its own folder, command, attempts and end.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vd4rl_pomdp.core.errors import TEMPORARY, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.runs import interrupt
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.folder import (
     DONE,
@@ -37,7 +39,6 @@ from vd4rl_pomdp.sweeps.folder import (
 from vd4rl_pomdp.sweeps.options import LocalOptions
 from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.stacks import in_stacks, kind_of, runs_alone, width_of, words_of_stack
 
 POLL_S = 0.5
 PAUSE_S = 60.0
@@ -105,7 +106,17 @@ class Driver:
                 self._collect()
                 interrupt.check("the sweep's jobs have ended")
         except BaseException:
-            self._stop()
+            # Every job is asked to end where nothing is lost; all at once, so that they share the patience.
+            for one in self._running:
+                one.process.terminate()
+            until = time.monotonic() + PATIENCE_S
+            for one in self._running:
+                try:
+                    one.process.wait(max(0.0, until - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    one.process.kill()
+                    one.process.wait()
+            self._collect()
             raise
         return all(map(is_finished, self._left.values()))  # others may have finished what was given up here
 
@@ -144,19 +155,17 @@ class Driver:
                 self._widths[job.name] = width_of(job, plan.made_in)
             return plan.made_in, tuple(plan.program), self._widths[job.name], kind
 
-        now: list[list[Job]] = []
-        small: list[list[Job]] = []
-        for jobs in in_stacks(ready, self._stack, attempts, alike):
-            grows = len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name])
-            (small if grows else now).append(jobs)
+        def small(jobs: list[Job]) -> bool:
+            return bool(len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name]))
+
+        # Only for what comes when a job that runs or starts here ends: else a place would be idle too long.
+        coming = running | {job.name for job in ready}
+        waiting = [(job, self._left.keys() & job.needs) for job in self._left.values() if job.name not in lost]
+        soon = {kind_of(job) for job, needs in waiting if needs and needs <= coming}
+        found = in_stacks(ready, self._stack, attempts, alike)
         if self._helps:
-            for some in (now, small):
-                random.shuffle(some)  # or all drivers would start the same one
-        # Only for what comes when a job that runs here ends: for anything else a place would be idle too long.
-        run = running | {job.name for jobs in now[: len(self._free)] for job in jobs}
-        waiting = {job.name: self._left.keys() & job.needs for job in self._left.values() if job.name not in lost}
-        soon = {kind_of(self._left[name]) for name, needs in waiting.items() if needs and needs <= run}
-        return now + [jobs for jobs in small if kind_of(jobs[0]) not in soon]
+            random.shuffle(found)  # or all drivers would start the same one
+        return sorted((jobs for jobs in found if not (small(jobs) and kind_of(jobs[0]) in soon)), key=small)
 
     def _is_anothers(self, job: Job) -> bool:
         """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
@@ -195,7 +204,11 @@ class Driver:
         for one in [one for one in self._running if one.process.poll() is not None]:
             self._running.remove(one)
             self._free += one.places
-            cause = cause_of(one.process.returncode)
+            code = one.process.returncode  # negative for a signal
+            if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
+                cause = INTERRUPTED
+            else:
+                cause = KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
             line = "" if cause == DONE else _line_of_end(one.log, one.log_size)
             self._end(one.jobs, cause, time.monotonic() - one.began, line)
 
@@ -224,19 +237,6 @@ class Driver:
             except UnavailableError as error:
                 print(f"warning: {error}", file=sys.stderr)
             say(row, len(self._jobs) - len(self._left), len(self._jobs))
-
-    def _stop(self) -> None:
-        """Ask every job to end where nothing is lost, and wait for it."""
-        for one in self._running:  # all at once, so that they share the patience
-            one.process.terminate()
-        until = time.monotonic() + PATIENCE_S
-        for one in self._running:
-            try:
-                one.process.wait(max(0.0, until - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                one.process.kill()
-                one.process.wait()
-        self._collect()
 
 
 def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:
@@ -277,13 +277,6 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
         if place.cores:
             os.sched_setaffinity(0, mine)
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
-def cause_of(code: int) -> str:
-    """How a job's process ended, by its exit code, negative for a signal, as `subprocess` has it."""
-    if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
-        return INTERRUPTED
-    return KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
 
 
 def _line_of_end(log: Path, start: int) -> str:
@@ -331,3 +324,62 @@ def visible_gpus() -> list[str]:
     count = torch.cuda.device_count()  # opens none of them
     shown = os.environ.get("CUDA_VISIBLE_DEVICES")
     return shown.split(",")[:count] if shown else [str(number) for number in range(count)]
+
+
+_OWN = ("--seed", "--view-seed", "--encoder", "--data", "--out")
+"""Flags in which the runs of a stack may differ."""
+STACKED = "finetune"
+
+
+def kind_of(job: Job) -> tuple[str, ...]:
+    """What jobs have in common that stack, as far as it can be told before their encoders are there; () if none may."""
+    if job.section != STACKED or job.settings.get("views") == "0":  # then pixels are read, by an encoder a run
+        return ()
+    words = list(job.words)
+    for flag in _OWN:
+        if flag in words:
+            del words[words.index(flag) : words.index(flag) + 2]
+    return *words, *(job.settings.get(name, "") for name in ("task", "algorithm"))  # those that the encoder decides
+
+
+def width_of(job: Job, made_in: Path) -> int | None:
+    """Width of what a fine-tuning is given of its encoder, which is there; None if it names none that can be read.
+
+    Args:
+        job: the fine-tuning.
+        made_in: which the paths in its command begin at.
+    """
+    try:
+        encoder = read_record(made_in / job.words[job.words.index("--encoder") + 1]).encoder
+    except (ValueError, UserError):
+        return None
+    told = {"readout": job.settings["readout"]} if "readout" in job.settings else {}
+    return replace(encoder, **told).dim  # type: ignore[arg-type]
+
+
+def runs_alone(rows: Iterable[Row]) -> bool:
+    """Whether a job is no longer stacked, judging by its attempts: a stack that it was in could not do it."""
+    return any("stack" in row and row["cause"] in (FAILED, KILLED) for row in rows)
+
+
+def in_stacks(
+    jobs: Iterable[Job], size: int, attempts: Mapping[str, list[Row]], alike: Callable[[Job], Hashable] = kind_of
+) -> list[list[Job]]:
+    """Jobs by the process that does them, in their order: stacks of up to `size`, and single ones.
+
+    Args:
+        jobs: those to do.
+        size: most jobs of a stack.
+        attempts: at them, by name.
+        alike: equal for jobs that stack; false for one that does not.
+    """
+    found = groups(jobs, lambda job: job.name if runs_alone(attempts.get(job.name, ())) else alike(job) or job.name)
+    return [group[first : first + size] for group in found.values() for first in range(0, len(group), size)]
+
+
+def words_of_stack(jobs: list[Job]) -> list[str]:
+    """The command that does some jobs, after `vd4rl-pomdp`."""
+    words = list(jobs[0].words)
+    for job in jobs[1:]:
+        words += ["+", *job.words[1:]]
+    return words

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_errors
-from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
 from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.plan import Job
@@ -158,14 +158,10 @@ class SweepFolder:
 
 def read_plan(path: Path) -> Plan:
     """A plan as it was written; UserError if it is damaged."""
-    try:
+    with damaged(path, "is damaged", "remove it and start `sweep run` again"):
         told = parse_json(read_bytes(path))
         jobs = [Job(**job | {"folder": Path(job["folder"])}) for job in told["jobs"]]
         return Plan(jobs, Path(told["made_in"]), Path(told["out"]), list(told["program"]))
-    except UserError:
-        raise
-    except (ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 
 
 def jobs_of(plans: Iterable[Plan]) -> list[Job]:

@@ -62,10 +62,8 @@ Sections = dict[str, Values]
 class GridCell:
     """One point of a grid: a set, an encoder and a policy, or whatever of the chain a grid asks for."""
 
-    shared: Values
-    """Values of SHARED, as far as they are told."""
     sections: Sections
-    """Settings by section, without axes."""
+    """Settings without axes."""
     named: Mapping[str, Sequence[str]]
     """By section, the settings that tell this cell from others of its grid: axes, what a block says, and of a set what
     a `where` says."""
@@ -74,6 +72,11 @@ class GridCell:
     def chain(self) -> tuple[str, ...]:
         """Its sections, in the order in which they depend on one another."""
         return tuple(name for name in SECTIONS if name in self.sections)
+
+    @property
+    def shared(self) -> Values:
+        """Values of SHARED, as far as they are told."""
+        return self.sections[""]
 
     @property
     def seed(self) -> int:
@@ -86,7 +89,7 @@ class GridCell:
         Raises:
             UserError: sections set that name to different values.
         """
-        return _value_of({"": self.shared} | self.sections, name)
+        return _value_of(self.sections, name)
 
 
 @dataclass(frozen=True)
@@ -105,11 +108,10 @@ class Where:
             section: {name: value for name, value in settings.items() if name not in last.get(section, {})}
             for section, settings in self.sections.items()
         }
-        merged = _merge({"": cell.shared} | cell.sections, own)
         # A set is known by its folder's name, which has to tell it from others; a run is found by what it computes.
         more = {section: own.get(section, {}) if section in _SETS else {} for section in cell.named}
         named = {section: list(dict.fromkeys([*names, *more[section]])) for section, names in cell.named.items()}
-        return GridCell(merged.pop(""), merged, named)
+        return GridCell(_merge(cell.sections, own), named)
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class Grid:
             for cell in _product(_merge(self.common, block, self.last), block):
                 for where in self.wheres:
                     cell = where.applied(cell, self.last)
-                cells.setdefault(repr((cell.shared, cell.sections)), cell)
+                cells.setdefault(repr(cell.sections), cell)
         return sorted(cells.values(), key=lambda cell: cell.seed)
 
 
@@ -157,13 +159,17 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
     told = _read(path, name)
     try:
         title, tests = told.pop("title", path.stem), told.pop("testing", {})
-        blocks = [_sections(block) for block in _tables(told, "block") or [{}]]
-        wheres, common = _tables(told, "where"), _sections(told)
+        tables = {name: told.pop(name, []) for name in ("block", "where")}
+        for kind, found in tables.items():
+            if not isinstance(found, list):
+                raise UserError(f"its {kind}s are no list of tables: write [[{kind}]]")
+        blocks, common = [_sections(block) for block in tables["block"] or [{}]], _sections(told)
         last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
         whole = [_merge(common, block) for block in blocks]
         for block in whole:
             _check_block(_merge(block, last))
-        return Grid(path.stem, str(title), common, blocks, [_where(table, whole) for table in wheres], last)
+        wheres = [_where(table, whole) for table in tables["where"]]
+        return Grid(path.stem, str(title), common, blocks, wheres, last)
     except UserError as error:
         raise UserError(f"{name}: {error}") from error
 
@@ -196,13 +202,6 @@ def _read(path: Path, name: str) -> Values:
     if not isinstance(told, dict):
         raise UserError(f"{path}: defines no dict called GRID; see the grids that ship for its form")
     return dict(told)
-
-
-def _tables(told: Values, name: str) -> list[Any]:
-    tables = told.pop(name, [])
-    if not isinstance(tables, list):
-        raise UserError(f"its {name}s are no list of tables: write [[{name}]]")
-    return tables
 
 
 def _sections(table: Any) -> Sections:
@@ -294,7 +293,7 @@ def _product(block: Sections, own: Sections) -> Iterator[GridCell]:
         sections = {section: dict(settings) for section, settings in block.items()}
         for (section, name), value in zip(axes, values, strict=True):
             sections[section][name] = value
-        yield GridCell(sections.pop(""), sections, named)
+        yield GridCell(sections, named)
 
 
 def _merge(*parts: Sections) -> Sections:

@@ -13,11 +13,8 @@ from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.results import Result
 from vd4rl_pomdp.sweeps.grid import GridCell
-from vd4rl_pomdp.sweeps.plan import DataSet, FoundRun, found_in, set_of
+from vd4rl_pomdp.sweeps.plan import DataSet, set_of, with_collections
 from vd4rl_pomdp.sweeps.stages import check_cells, config_of, recipe_of, recorded
-
-_NOWHERE = Path()
-"""Sets are told by how they were collected, not by where they lie."""
 
 
 class GridMembers(Choice):
@@ -36,19 +33,22 @@ class GridMembers(Choice):
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
         self._policies: set[tuple[Any, ...]] = set()
+        """Values of LABELS of the policies that cells train."""
         check_cells(cells, name)
         for cell in cells:
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
-            data = set_of(cell, _NOWHERE)
+            data = set_of(cell, Path())  # told by how it was collected, not by where it lies
             for section in cell.chain[1:]:
                 self._sets[recipe_of(cell, section)].append(data)
             if "finetune" in cell.chain:
-                self._policies.add(_policy(cell, data))
+                before, algorithm = recorded(cell, "pretrain"), recorded(cell, "finetune")["algorithm"]
+                named = data.wanted["task"], set_quality(config_of(cell, data.section)), before["corruption"]
+                self._policies.add((before["method"], *named, algorithm, cell.seed))
 
     def among(self, results: list[Result]) -> list[Result]:
         """Those of some runs that are the grid's, in their order; UserError if none is."""
-        found = [run for run, seen in zip(results, found_in(results), strict=True) if self._has(run, seen)]
+        found = [run for run in with_collections(results) if self._has(run)]
         if not found:
             raise UserError(f"none of {len(results)} runs is {self._asked}; `sweep run --dry-run` lists the cells")
         return found
@@ -62,17 +62,10 @@ class GridMembers(Choice):
         """Labels of the policies that the cells ask for."""
         return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
-    def _has(self, run: Result, seen: FoundRun) -> bool:
+    def _has(self, run: Result) -> bool:
         """Whether some cell asks for it; one on a set that nobody collected is told by task and quality."""
-        sets = self._sets.get(seen.recipe, ())
-        if seen.record.get("collection"):
-            return seen.on_one_set and any(data.alike(seen.record) for data in sets)
+        sets = self._sets.get(run.recipe, ())
+        if run.record.get("collection"):
+            return run.on_one_set and any(data.alike(run.record) for data in sets)
         labels = {name: run.labels[name] for name in ("task", "quality")}
-        return seen.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
-
-
-def _policy(cell: GridCell, data: DataSet) -> tuple[Any, ...]:
-    """Values of LABELS of the policy that a cell trains on its set."""
-    before, algorithm = recorded(cell, "pretrain"), recorded(cell, "finetune")["algorithm"]
-    quality = set_quality(config_of(cell, data.section))
-    return before["method"], data.wanted["task"], quality, before["corruption"], algorithm, cell.seed
+        return run.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.registry import BY_CALL, REGISTRIES, origins
+from vd4rl_pomdp.core.registry import BY_CALL, REGISTRIES, code_of
 
 JOB_VARIABLE = "VD4RL_POMDP_JOB"
 """Set in the environment of a job's process: a second signal ends it no sooner, and it may start no sweep."""
@@ -36,7 +36,7 @@ def program_here() -> str:
 def refuse_unknown_to_jobs(settings: Mapping[str, str]) -> None:
     """Raise UserError if settings name a part that the process of a job could not know."""
     if not own_program():
-        for part, origin in origins(settings).items():
+        for part, origin in code_of(settings)["plugins"].items():
             if origin == BY_CALL:
                 raise UserError(
                     f"{part}: was registered in this process alone, and jobs have processes of their own: register it "

@@ -5,7 +5,7 @@ A run is known by what it computes (its recipe) and by the content of its set, w
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -23,9 +23,8 @@ from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
-from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json
-from vd4rl_pomdp.runs.results import Result, read_results
-from vd4rl_pomdp.runs.run import recipe
+from vd4rl_pomdp.runs.files import content_hash, files_below, groups, read_json
+from vd4rl_pomdp.runs.results import Result, read_records, read_results
 from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told
@@ -75,8 +74,16 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError unless its folder holds the set, or the set can be collected there."""
-        if self.foreign:
-            self._check_foreign()
+        if self.foreign:  # shards that nothing here collected
+            shards = shard_paths(self.folder)
+            if self.section != "collect":
+                return
+            task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
+            wanted = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
+            for has, asked in zip((task, read_frame_size(shards)), wanted, strict=True):
+                if has not in (None, asked):
+                    what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
+                    raise UserError(f"{self.folder}: holds {what}, the grid says {asked}; choose another --data")
         elif (self.folder / PLAN).exists():
             stored = read_json(self.folder / PLAN)
             for name in differing(stored, self.wanted)[:1]:
@@ -90,18 +97,6 @@ class DataSet:
                     f"{self.folder}: holds no set, and the quality {self.wanted['quality']!r} cannot be collected: "
                     f"put the set there, or choose one of {', '.join(SET_QUALITIES)}"
                 )
-
-    def _check_foreign(self) -> None:
-        """Raise UserError if shards that nothing here collected tell another task, or frames of another size."""
-        shards = shard_paths(self.folder)
-        if self.section != "collect":
-            return
-        task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
-        asked = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
-        for has, wanted in zip((task, read_frame_size(shards)), asked, strict=True):
-            if has not in (None, wanted):
-                what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
-                raise UserError(f"{self.folder}: holds {what}, the grid says {wanted}; choose another --data")
 
     def made(self, record: Mapping[str, Any]) -> bool:
         """Whether a run, as its config.json tells it, was trained on this set."""
@@ -124,65 +119,28 @@ def set_of(cell: GridCell, root: Path) -> DataSet:
     return DataSet(name, inner if inner.is_dir() else root / name, section, wanted)
 
 
-@dataclass(frozen=True)
-class FoundRun:
-    """A run that is there: below a sweep's folder, or in a row that was kept."""
-
-    folder: Path
-    record: Row
-    """Its config.json."""
-    card: Row
-    """What its encoder says of its pretraining, empty where it has none."""
-    finished: bool
-
-    @cached_property
-    def recipe(self) -> str:
-        """What it computes, but for its data's content."""
-        return recipe(self.record, self.card if self.record["stage"] == "finetune" else {})
-
-    @property
-    def data(self) -> str:
-        """Fingerprint of its set, empty where it tells none."""
-        return self.record.get("inputs", {}).get("data", "")
-
-    @property
-    def on_one_set(self) -> bool:
-        """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
-        return self.card.get("data") in (None, self.data)
-
-
-def runs_below(out: Path) -> Iterator[FoundRun]:
-    """Every run below a folder; UserError for a damaged record."""
+def runs_below(out: Path) -> Iterator[Result]:
+    """Every run below a folder, without its rows; UserError for a damaged record."""
     for path in files_below(out, CONFIG_FILE):
         record = read_json(path)
         if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
-            yield run_at(path.parent)
+            yield read_records(path.parent)
 
 
-def run_at(folder: Path) -> FoundRun:
-    """The run of a folder that holds one; UserError for a damaged record."""
-    encoder = folder / "encoder" / CONFIG
-    card = read_json(encoder).get("pretrain") if encoder.exists() else None
-    return FoundRun(folder, read_json(folder / CONFIG_FILE), _whole(card), (folder / TIMING_FILE).is_file())
-
-
-def runs_kept(folders: Iterable[Path]) -> list[FoundRun]:
+def runs_kept(folders: Iterable[Path]) -> list[Result]:
     """Every run of some results folders; UserError for a folder that is none."""
-    return found_in([run for folder in folders for run in read_results(folder)])
+    return with_collections([run for folder in folders for run in read_results(folder)])
 
 
-def found_in(results: Iterable[Result]) -> list[FoundRun]:
+def with_collections(runs: Iterable[Result]) -> list[Result]:
     """Some runs, in their order; how a set was collected may be told by another run on the same content."""
-    runs = [FoundRun(run.path, run.record, _whole(run.card), run.finished) for run in results]
     told = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
     return [
-        replace(run, record=run.record | {"collection": run.record.get("collection") or told.get(run.data)})
+        replace(run, files=run.files | {"config": run.record | {"collection": told[run.data]}})
+        if run.data in told and not run.record.get("collection")
+        else run
         for run in runs
     ]
-
-
-def _whole(card: Any) -> Row:
-    return card if isinstance(card, dict) and {"settings", "seed"} <= card.keys() else {}
 
 
 @dataclass(frozen=True)
@@ -214,7 +172,7 @@ class Job:
             return self.done or (self.folder / PROVENANCE).is_file()
         if not (self.folder / TIMING_FILE).is_file():
             return False
-        run = run_at(self.folder)
+        run = read_records(self.folder)
         return run.recipe == self.recipe and self.content in ("", run.data)
 
     @property
@@ -224,7 +182,7 @@ class Job:
 
 
 def plan_jobs(
-    cells: Iterable[GridCell], out: Path, data: Path, kept: Iterable[FoundRun] = (), others: Iterable[Job] = ()
+    cells: Iterable[GridCell], out: Path, data: Path, kept: Iterable[Result] = (), others: Iterable[Job] = ()
 ) -> tuple[list[Job], list[str]]:
     """The jobs of some cells, each after those it needs, and what one should know of those that are done.
 
@@ -249,11 +207,11 @@ def plan_jobs(
 class _Planner:
     """Jobs by what they make."""
 
-    def __init__(self, out: Path, data: Path, kept: Iterable[FoundRun], others: Iterable[Job]) -> None:
+    def __init__(self, out: Path, data: Path, kept: Iterable[Result], others: Iterable[Job]) -> None:
         self._out, self._data = out, data
         here = list(runs_below(out))
-        self._here, self._kept = _by_recipe(here), _by_recipe(kept)
-        self._folders = {run.folder for run in here}
+        self._here, self._kept = (groups(runs, lambda run: run.recipe) for runs in (here, kept))
+        self._folders = {run.path for run in here}
         self._names = {job.name: job.recipe for job in others}
         """What has a name, by that name."""
         self._jobs: dict[tuple[str, str, str], Job] = {}
@@ -266,27 +224,21 @@ class _Planner:
 
     def add(self, cell: GridCell) -> None:
         """Want what a cell asks for."""
-        data = self._set(cell)
-        before = [self._collection(cell, data)]
+        data = set_of(cell, self._data)
+        if data.name not in self._sets:
+            data.check()
+            self._of_other_code.update(of_other_code(read_plan(data.folder), data.wanted))
+        data = self._sets.setdefault(data.name, data)
+        words = [*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder)]
+        settings = _words_by_name(data.wanted)
+        job = Job(f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=settings)
+        before = [self._jobs.setdefault((data.section, "", data.name), job)]
         values: dict[str, Any] = {}
         for section in cell.chain[1:]:
             # A policy's folder is told by its encoder's settings, too.
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
         self._ask(before[-1], data)
-
-    def _set(self, cell: GridCell) -> DataSet:
-        found = set_of(cell, self._data)
-        if found.name not in self._sets:
-            found.check()
-            self._of_other_code.update(of_other_code(read_plan(found.folder), found.wanted))
-        return self._sets.setdefault(found.name, found)
-
-    def _collection(self, cell: GridCell, data: DataSet) -> Job:
-        words = [*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder)]
-        settings = _words_by_name(data.wanted)
-        job = Job(f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=settings)
-        return self._jobs.setdefault((data.section, "", data.name), job)
 
     def _training(self, cell: GridCell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
         own = recipe_of(cell, section)
@@ -299,7 +251,7 @@ class _Planner:
             encoder = before[-1].folder / "encoder"
             if section == "finetune" and (encoder / CONFIG).is_file():
                 self._on_other_encoders += run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
-            name, content = run.folder.relative_to(self._out).as_posix(), run.data
+            name, content = run.path.relative_to(self._out).as_posix(), run.data
         else:
             name, content = self._free(_run_folder(cell, section, data.name, values), own), ""
         self._names[name] = own
@@ -355,14 +307,7 @@ class _Planner:
             yield f"{number} policies count that began with other encoders than their pretrainings' folders now hold"
 
 
-def _by_recipe(runs: Iterable[FoundRun]) -> dict[str, list[FoundRun]]:
-    found = defaultdict(list)
-    for run in runs:
-        found[run.recipe].append(run)
-    return dict(found)
-
-
-def _found(runs: Mapping[str, list[FoundRun]], own: str, data: DataSet) -> FoundRun | None:
+def _found(runs: Mapping[str, list[Result]], own: str, data: DataSet) -> Result | None:
     """The run of a recipe on a set, a finished one if there is one; images that it adds are those of now."""
     fitting = []
     for run in runs.get(own, ()):

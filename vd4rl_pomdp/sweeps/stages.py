@@ -62,7 +62,7 @@ def check_cells(cells: Sequence[GridCell], grid: str) -> None:
     try:
         for cell in cells:
             refuse_number("seed", cell.seed, 0, MAX_SEED)
-        for cell in {repr((cell.shared | {"seed": 0}, cell.sections)): cell for cell in cells}.values():
+        for cell in {repr(cell.sections | {"": cell.shared | {"seed": 0}}): cell for cell in cells}.values():
             config_of(cell, cell.chain[0])
             for section in cell.chain[1:]:
                 recorded(cell, section)

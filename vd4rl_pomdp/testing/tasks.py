@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.envs.make import layout_of, make_env
+from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
 from vd4rl_pomdp.testing.contract import Check, claim, run_checks
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
 
 SIZES = (84, 32)
 DECISIONS = 12
@@ -34,8 +33,6 @@ def check_task(name: str) -> None:
 
 def make(name: str, size: int | None = None, length: int = DECISIONS) -> PixelEnv:
     """A task's environment with short episodes."""
-    from vd4rl_pomdp.envs.make import make_env
-
     return make_env(TASKS.named(name), size=size, length=length)
 
 
@@ -85,8 +82,6 @@ def frames_stay_as_they_were(name: str) -> None:
 
 def rows_have_the_declared_widths(name: str) -> None:
     """Rows hold states of the task's layout, which is that of its environment, and finite rewards, 0 in the first."""
-    from vd4rl_pomdp.envs.make import layout_of
-
     task = TASKS.named(name)
     found = layout_of(replace(task, layout=None))
     claim(layout_of(task) == found, f"its layout says {task.layout}, the environment has {found}")

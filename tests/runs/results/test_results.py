@@ -45,7 +45,7 @@ def content(run: Result) -> tuple:
 def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
     run, before = whole_run(tmp_path / "runs/a"), pretraining(tmp_path / "runs/b")
     added = add_results([tmp_path / "runs"], tmp_path / "out")
-    assert added.in_words == "2 runs added"
+    assert added == "2 runs added"
     (one, other) = read_results(str(tmp_path / "out"))
     for name in ("config", "labels", "timing", "machine", "render", "probe", "pretrain_timing", "reference", "critic"):
         assert one.files[name] == read_json(run / f"{name}.json"), name
@@ -74,7 +74,7 @@ def test_a_full_disk_leaves_the_folder_as_it_was_and_the_same_command_adds(tmp_p
             with pytest.raises(UserError, match="the disk is full"):
                 add_results([tmp_path / "runs"], tmp_path / "out")
         assert {path: path.read_bytes() for path in tmp_path.glob("out/[!.]*")} == before
-        assert add_results([tmp_path / "runs"], tmp_path / "out").added == 1
+        assert add_results([tmp_path / "runs"], tmp_path / "out").startswith("1 run added")
 
 
 def test_a_run_that_went_on_elsewhere_names_every_machine_and_commit(tmp_path):
@@ -115,7 +115,7 @@ def test_rows_may_come_after_their_page_and_their_grid(tmp_path, name, taken):
     (tmp_path / "out" / name).touch()
     run = whole_run(tmp_path / "run")
     if taken:
-        assert add_results([run], tmp_path / "out").added == 1
+        assert add_results([run], tmp_path / "out").startswith("1 run added")
     else:
         with pytest.raises(UserError, match="is not empty and holds no results"):
             add_results([run], tmp_path / "out")
@@ -137,7 +137,7 @@ def test_a_diverged_run_is_a_result(tmp_path):
     run = whole_run(tmp_path / "runs/0")
     (run / "timing.json").unlink()
     write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
-    assert add_results([run], tmp_path / "out").added == 1
+    assert add_results([run], tmp_path / "out").startswith("1 run added")
     (found,) = read_results(tmp_path / "out")
     assert (found.finished, found.settled, found.diverged["step"]) == (False, True, 7)
 
@@ -155,10 +155,12 @@ def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(
     for paths in ([run, tmp_path / "out"], [tmp_path / "out", run]):
         assert [found.finished for found in find_results(paths)] == [True]
     write_report([run], tmp_path / "report")
-    assert add_results([run], tmp_path / "out") == (1, 0, 0, 0)
+    assert add_results([run], tmp_path / "out") == "1 run added"
     for out in ("out", "report"):
         assert [(found.finished, found.rows[-1]["score"]) for found in read_results(tmp_path / out)] == [(True, 2.0)]
-    assert add_results([diverged], tmp_path / "out") == (0, 0, 1, 0), "and never the other way round"
+    assert add_results([diverged], tmp_path / "out").startswith("0 runs added, 1 there already with other rows"), (
+        "and never the other way round"
+    )
 
 
 def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
@@ -195,7 +197,7 @@ def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeyp
             add_results([whole_run(tmp_path / "runs/1", seed=1)], tmp_path / "out")
     assert {row["seed"] for row in read_episodes(tmp_path / "out" / "episodes.csv")} == {0, 1}, "one file was written"
     assert [content(run) for run in read_results(tmp_path / "out")] == before
-    assert add_results([tmp_path / "runs"], tmp_path / "out") == (1, 1, 0, 0)
+    assert add_results([tmp_path / "runs"], tmp_path / "out") == "1 run added, 1 there already"
     assert [len(run.rows) for run in read_results(tmp_path / "out")] == [2, 2]
 
 

@@ -13,8 +13,15 @@ from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import MazeData, open_data, open_maze_set
 from vd4rl_pomdp.studies.navigation.measures import METHOD_NAMES, OBJECTIVES
-from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe, refit
-from vd4rl_pomdp.studies.navigation.train import ProbedObjective, learning_rate, make_trainer, train
+from vd4rl_pomdp.studies.navigation.train import (
+    ErrorSums,
+    ProbedObjective,
+    StateProbe,
+    learning_rate,
+    make_trainer,
+    refit,
+    train,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -289,19 +296,19 @@ def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
 
 
 def test_the_mixer_refuses_sizes_it_cannot_cut():
-    from vd4rl_pomdp.nn.frame import FrameOptions, make_frame_encoder
+    from vd4rl_pomdp.nn.frame import make_frame_encoder
 
-    assert make_frame_encoder("mixer", 3, 100, FrameOptions(16))(
+    assert make_frame_encoder("mixer", 3, 100, {"feature_dim": 16})(
         torch.zeros(2, 3, 100, 100, dtype=torch.uint8)
     ).shape == (2, 16)
     with pytest.raises(UserError, match="84 is no multiple"):
-        make_frame_encoder("mixer", 9, 84, FrameOptions(16))
+        make_frame_encoder("mixer", 9, 84, {"feature_dim": 16})
 
 
 def test_the_mixer_has_the_papers_shape():
-    from vd4rl_pomdp.nn.frame import FrameOptions, MixerLayer, make_frame_encoder
+    from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
 
-    encoder = make_frame_encoder("mixer", 3, 100, FrameOptions())
+    encoder = make_frame_encoder("mixer", 3, 100, {})
     layers = [m for m in encoder.modules() if isinstance(m, MixerLayer)]
     assert len(layers) == 8
     assert layers[0].over_patches[0].in_features == 100

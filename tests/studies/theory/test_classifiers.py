@@ -7,9 +7,8 @@ from pretrain.config import PretrainConfig
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, compare
-from vd4rl_pomdp.studies.theory.gallery import WORLDS, biased, counterexample, echo, momentum
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import future_memory, past_memory
+from vd4rl_pomdp.studies.theory.world import WORLDS, biased, counterexample, echo, future_memory, momentum, past_memory
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 LIMIT = 2

@@ -7,8 +7,8 @@ from gymnasium.utils.env_checker import check_env
 
 import vd4rl_pomdp.envs
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.studies.theory.gallery import BLANK, counterexample
 from vd4rl_pomdp.studies.theory.study import enumerated, inverse_examples
+from vd4rl_pomdp.studies.theory.world import BLANK, counterexample
 
 K2 = {((1, -1), (0, -1)), ((-1, 1), (0, 1)), ((-1, -1), (2, -1)), ((1, 1), (2, 1))}
 K4 = """

@@ -6,9 +6,19 @@ from hypothesis import given, settings
 
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.studies.theory.gallery import NOISE, biased, counterexample, echo, momentum
 from vd4rl_pomdp.studies.theory.law import joint_law
-from vd4rl_pomdp.studies.theory.world import diameter, future_memory, past_memory, uniform, with_noise
+from vd4rl_pomdp.studies.theory.world import (
+    NOISE,
+    biased,
+    counterexample,
+    diameter,
+    echo,
+    future_memory,
+    momentum,
+    past_memory,
+    uniform,
+    with_noise,
+)
 
 HALF = Fraction(1, 2)
 LONGEST = 3

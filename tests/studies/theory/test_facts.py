@@ -8,22 +8,24 @@ from hypothesis import HealthCheck, assume, given, settings
 
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash, compare
-from vd4rl_pomdp.studies.theory.gallery import (
+from vd4rl_pomdp.studies.theory.law import joint_law
+from vd4rl_pomdp.studies.theory.partition import state_relation
+from vd4rl_pomdp.studies.theory.study import CLAIMED, facts, inverse_examples
+from vd4rl_pomdp.studies.theory.views import VIEWS
+from vd4rl_pomdp.studies.theory.world import (
     alternator,
     counterexample,
+    distances,
     echo,
     hidden_switch,
     idle,
     ladder,
     momentum,
+    past_memory,
+    period,
     switch,
     toggle,
 )
-from vd4rl_pomdp.studies.theory.law import joint_law
-from vd4rl_pomdp.studies.theory.partition import state_relation
-from vd4rl_pomdp.studies.theory.study import CLAIMED, facts, inverse_examples
-from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import distances, past_memory, period
 
 
 def test_every_fact_is_computed_and_contradicts_what_is_printed():

@@ -19,10 +19,9 @@ from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.heads import all_pairs
 from vd4rl_pomdp.nn.objective import InverseObjective
 from vd4rl_pomdp.studies.theory.env import ExactWindows, exact_windows
-from vd4rl_pomdp.studies.theory.gallery import BLANK, counterexample
 from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import World, finite_world
+from vd4rl_pomdp.studies.theory.world import BLANK, World, counterexample, finite_world
 
 MAX_K, M = 2, 1
 ABOVE, BELOW = 0.02, 1e-4

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths
-from vd4rl_pomdp.studies.theory.gallery import NOISE, biased, counterexample, echo, momentum
 from vd4rl_pomdp.studies.theory.partition import (
     discards_noise,
     forced_shares,
@@ -15,7 +14,7 @@ from vd4rl_pomdp.studies.theory.partition import (
     state_relation,
 )
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import with_noise
+from vd4rl_pomdp.studies.theory.world import NOISE, biased, counterexample, echo, momentum, with_noise
 
 MEMORY = MemoryLengths(3, 3)
 

@@ -1,1 +1,1 @@
-"""The memories that come with the package, one file each, and what a memory is."""
+"""The memories that come with the package, and what a memory is."""

@@ -7,7 +7,7 @@ resumes an interrupted collection and ends in the same files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -73,10 +73,22 @@ def collect(config: MazeCollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     check_config(config)
     refuse_inside(config.out)
-    shape = config.seed, config.trajectory_rows, config.action_repeat
+    maze, packages = get_maze(config.maze), ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
+    attributes = {
+        "task": config.maze,
+        "policy": maze.driver,
+        "seed": config.seed,
+        "action_repeat": config.action_repeat,
+        "noise": maze.style.noise,
+        "zero_share": maze.style.zero_share,
+        "random_share": maze.style.random_share,
+        "versions": {k: v for k, v in versions().items() if k in packages},
+    }
+    shape, step = (config.seed, config.trajectory_rows, config.action_repeat), config.trajectories_per_shard
+    jobs = [_Job(config.maze, number, *shape) for number in range(config.trajectories)]
     shards = [
-        Shard(path, [_Job(config.maze, i, *shape) for i in trajectories], _attributes(config))
-        for path, trajectories in _plan(config)
+        Shard(config.out / f"{number}_{config.maze}.hdf5", jobs[start : start + step], attributes)
+        for number, start in enumerate(range(0, len(jobs), step))
     ]
     title = f"collect {config.maze}", "trajectories"
     collect_set(config.out, collection(config), shards, _roll_out, config.workers, title, config.maze)
@@ -95,13 +107,6 @@ def check_config(config: MazeCollectConfig) -> None:
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
     )  # fmt: skip
-
-
-def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:
-    """Shards to write: file and trajectory numbers."""
-    for number, start in enumerate(range(0, config.trajectories, config.trajectories_per_shard)):
-        stop = min(start + config.trajectories_per_shard, config.trajectories)
-        yield config.out / f"{number}_{config.maze}.hdf5", range(start, stop)
 
 
 @dataclass(frozen=True)
@@ -167,22 +172,6 @@ def _environment(maze: str, action_repeat: int) -> MazeEnv:
     from vd4rl_pomdp.envs.maze import MazeEnv
 
     return MazeEnv(maze, action_repeat)
-
-
-def _attributes(config: MazeCollectConfig) -> dict[str, Any]:
-    maze = get_maze(config.maze)
-    style = maze.style
-    packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
-    return {
-        "task": config.maze,
-        "policy": maze.driver,
-        "seed": config.seed,
-        "action_repeat": config.action_repeat,
-        "noise": style.noise,
-        "zero_share": style.zero_share,
-        "random_share": style.random_share,
-        "versions": {k: v for k, v in versions().items() if k in packages},
-    }
 
 
 def sample_observations() -> dict[str, np.ndarray]:

@@ -5,6 +5,7 @@ Exogenous noise may be added to the pictures; the small presets see a quarter of
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -16,7 +17,6 @@ from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.envs.mazes import MAZES, PICTURE_SIZE, MazeSpec
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, Picture, to_grey50, to_rgb50
-from vd4rl_pomdp.studies.navigation.probe import TrueStates
 
 _BLOCK = 1000
 HELD_OUT = 10
@@ -35,7 +35,8 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
     ):
         if wrong:
             raise UserError(f"{path}: {what}; collect a set with `vd4rl-pomdp navigation collect`")
-    check_trajectories(dataset.num_episodes, str(path))
+    if dataset.num_episodes < 2:
+        raise UserError(f"{path}: a single trajectory leaves none to be held out; collect more --trajectories")
     if (rows := dataset.episode_end - dataset.episode_start).min() < 2:
         raise UserError(
             f"{path}: trajectory {int(rows.argmin())} is a single row, without a step; take it out of the set, or "
@@ -44,10 +45,30 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
     return dataset, MAZES[names.pop()]
 
 
-def check_trajectories(number: int, where: str) -> None:
-    """Raise UserError for a set of so few trajectories that none can be held out."""
-    if number < 2:
-        raise UserError(f"{where}: a single trajectory leaves none to be held out; collect more --trajectories")
+@dataclass(frozen=True)
+class TrueStates:
+    """Standardised states of all rows of a set."""
+
+    values: Tensor
+    """(N, 4) float32."""
+    hidden: Tensor
+    """(N,) bool: a curtain covers the whole mass."""
+    mean: Tensor
+    std: Tensor
+    """(4,) float32, of the training rows."""
+
+    @classmethod
+    def of(cls, dataset: Dataset, maze: MazeSpec, training_rows: int) -> TrueStates:
+        """States of a set, standardised by its first `training_rows` rows."""
+        assert dataset.physics is not None
+        raw = torch.from_numpy(dataset.physics[:, maze.position + maze.velocity])
+        std, mean = torch.std_mean(raw[:training_rows], dim=0)
+        hidden = torch.from_numpy(maze.hidden(dataset.physics))
+        return cls(((raw - mean) / std).float(), hidden, mean.float(), std.float())
+
+    def to(self, device: torch.device) -> TrueStates:
+        """Copy on a device."""
+        return TrueStates(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
 
 class MazeView(View):
@@ -101,21 +122,21 @@ class MazeData:
         self.total = dataset.num_windows(config.window)
         self.training = int(dataset.windows_per_episode(config.window)[: self.first_held_out].sum())
         """Windows 0..training-1 are for training, the rest is held out."""
-        self._view: View = MazeView(dataset, noise)
+        self.view: View = MazeView(dataset, noise)
         self.inputs = {"data": dataset.fingerprint} | ({} if noise is None else {"exogenous": noise.fingerprint()})
         """What a run on it reads, by name and content."""
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""
-        if isinstance(self._view, MazeView) and self._config.picture != "rgb100":
-            self._view = self._view.shrunk(self._config.picture)
+        if isinstance(self.view, MazeView) and self._config.picture != "rgb100":
+            self.view = self.view.shrunk(self._config.picture)
         self.dataset.to(device)
         self.states = self.states.to(device)
         return self
 
     def windows(self, number: Tensor, length: int | None = None) -> Windows:
         """Windows by (B,) numbers, as the model sees them."""
-        return self._view.windows(number, length or self._config.window)
+        return self.view.windows(number, length or self._config.window)
 
     def spread(self, count: int, held_out: bool) -> list[Tensor]:
         """Numbers of `count` windows, evenly spread over the training or the held-out ones, in batches."""

@@ -170,10 +170,10 @@ def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> 
     """
     tables = {name: read_trajectory(file) for name, file in trajectories.items()}
     ground = _ground(maze)
-    frames = [
-        _join([_panel(name, table, row, maze, ground) for name, table in tables.items()])
-        for row in range(min(len(table["x"]) for table in tables.values()))
-    ]
+    frames = []
+    for row in range(min(len(table["x"]) for table in tables.values())):
+        panels = [np.asarray(_panel(name, table, row, maze, ground)) for name, table in tables.items()]
+        frames.append(Image.fromarray(np.concatenate(panels, axis=1)))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=_MILLISECONDS, loop=0)
 
 
@@ -212,11 +212,3 @@ def _ground(maze: MazeSpec) -> Image.Image:
 def _around(x: float, y: float, radius: float) -> list[float]:
     (left, top), (right, bottom) = to_pixels(x - radius, y + radius), to_pixels(x + radius, y - radius)
     return [_FINE * number for number in (left, top, right, bottom)]
-
-
-def _join(panels: list[Image.Image]) -> Image.Image:
-    """Panels side by side."""
-    joined = Image.new("RGB", (sum(panel.width for panel in panels), panels[0].height), _PAPER)
-    for number, panel in enumerate(panels):
-        joined.paste(panel, (number * panel.width, 0))
-    return joined

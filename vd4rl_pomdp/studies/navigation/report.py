@@ -88,6 +88,9 @@ Line = tuple[str, str, str, Condition, Measure]
 def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
     """The paper's six tables (position and velocity are one of them), then four of our own: one line a number.
 
+    Their layout is a frame with a line for every number that a table has a place for; the numbers are a group-by of
+    the frame of runs, merged into it.
+
     Returns:
         `table`, `view` and `row` where the number stands, KEYS, `numbers` by seed, their `mean`, `low` and `high` (95%
         t interval), `seeds` and `of_seeds`, those with which the maze was trained under any condition; the `paper`'s
@@ -271,7 +274,11 @@ class Verdict(NamedTuple):
 
 
 def claims(maze: str) -> list[Claim]:
-    """The claims about one maze: first whether training has gone far enough to compare, then the paper's statements."""
+    """The claims about one maze: first whether training has gone far enough to compare, then the paper's statements.
+
+    Their wording and their bounds (half, three times) are this package's; some hold encoders against an untrained one,
+    which the paper's tables do not have.
+    """
 
     def of(method: str, measure: Measure | str, max_k: int = 15, **options: bool) -> ClaimSide:
         named = refitted_error(measure) if isinstance(measure, str) else measure
@@ -341,7 +348,8 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
     both = [(maze, percent, raw) for maze, percent, raw in pairs if raw.seeds and raw.claim != percent.claim]
     other = [f"{maze}: {percent.claim.text}" for maze, percent, raw in both if percent.holds != raw.holds]
     changes = f"{len(other)} change ({'; '.join(other)})" if other else "none changes"
-    recorder = ", ".join(f"{number:.1f} ({maze})" for maze, number in _paper_positions())
+    of_ah = {maze: paper_number(Condition(maze, "ah+a"), online_error("position").raw()) for maze in MAZES}
+    recorder = ", ".join(f"{number:.1f} ({maze})" for maze, number in of_ah.items() if number is not None)
     return [
         "## Which statements hold",
         "",
@@ -359,13 +367,6 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
         f"and need not keep the state. In the paper its position error is {recorder}.",
         "",
     ]
-
-
-def _paper_positions() -> Iterator[tuple[str, float]]:
-    """The paper's position error of ah+a, by maze."""
-    for maze in MAZES:
-        if (number := paper_number(Condition(maze, "ah+a"), online_error("position").raw())) is not None:
-            yield maze, number
 
 
 def _verdict_row(maze: str, percent: Verdict, raw: Verdict) -> str:
@@ -443,7 +444,9 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
         pictures = _draw(runs, frame, drawn, out / "figures")
         cells = make_tables(frame)
         write_tables(cells, out / "tables.csv")
-        lines = [*_head(runs, unfinished), *verdict_lines(frame), *pictures, *table_sections(cells), *_commands(runs)]
+        lines = [*_head(runs, unfinished), *verdict_lines(frame), *pictures, *table_sections(cells), _COMMANDS]
+        commands = [(run.command, run.condition.maze, run.result.files["timing"]["seconds"]) for run in runs]
+        lines += code_block([f"{words}  # {maze}, {float(seconds):.0f} s" for words, maze, seconds in commands], "bash")
         write_text(out / "report.md", "\n".join(lines) + "\n")
     return out / "report.md"
 
@@ -519,11 +522,3 @@ def _unlike(runs: list[NavigationRun]) -> list[str]:
             if where:
                 lines.append(f"Not alike in {code(maze)}: {name} is {found[0]}, but {'; '.join(where)}.  ")
     return [*lines, ""] if lines else []
-
-
-def _commands(runs: list[NavigationRun]) -> list[str]:
-    """The command of every run behind the tables."""
-    commands = [
-        f"{run.command}  # {run.condition.maze}, {float(run.result.files['timing']['seconds']):.0f} s" for run in runs
-    ]
-    return [_COMMANDS, *code_block(commands, "bash")]

@@ -2,6 +2,10 @@
 
 A run folder holds config.json, metrics.jsonl (means over `log_every` steps), encoder/, trajectory.csv and, at its end,
 results.json: every number the report needs, as rows of (measure, split, probe, rows, k, value).
+
+An MLP estimates the true state, standardised (x, y, vx, vy), from a representation: trained beside it, or refitted on
+it frozen. Errors are mean absolute errors in two units: percent of a standard deviation, where predicting the mean
+gives some 65 to 100, and the simulator's own, times 100.
 """
 
 from __future__ import annotations
@@ -15,19 +19,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pretrain.build import build_objective, build_target
 from pretrain.train import Trainer
 from vd4rl_pomdp.core.options import flat, settings_of
-from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.streams import random_stream
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import WindowSampler
 from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
+from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
+from vd4rl_pomdp.nn.policy import Standardise
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.files import replacing_file, write_json
@@ -38,7 +45,88 @@ from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import MazeData, open_data
 from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure, measure_rows
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES
-from vd4rl_pomdp.studies.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
+
+STATE_DIM = 4
+COMPONENTS = {"state": slice(0, 4), "position": slice(0, 2), "velocity": slice(2, 4)}
+_BATCH = 1024
+_LEARNING_RATE = 1e-3
+
+
+class StateProbe(nn.Module):
+    """Two hidden layers of 256 units: (..., D) representations -> (..., 4) states."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.standardise = Standardise(dim)
+        self.net = mlp(dim, 256, STATE_DIM, layers=2)
+
+    def forward(self, z: Tensor, frozen: bool = True) -> Tensor:
+        """Estimated states; no gradient reaches the representation unless it is not `frozen`."""
+        return self.net(self.standardise(z.detach() if frozen else z))
+
+
+class ErrorSums(nn.Module):
+    """Sums of absolute errors and their counts: over all rows and over hidden ones. Both are part of its state."""
+
+    sums: Tensor
+    counts: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("sums", torch.zeros(2, STATE_DIM, dtype=torch.float64))
+        self.register_buffer("counts", torch.zeros(2, dtype=torch.float64))
+
+    def add(self, estimate: Tensor, truth: Tensor, hidden: Tensor, burn_in: int) -> None:
+        """Count (B, T, 4) estimates against truths, a GPU is not waited for; rows before `burn_in` are left out."""
+        error = (estimate.detach().float() - truth)[:, burn_in:].abs().flatten(0, 1)
+        under = hidden[:, burn_in:].flatten()
+        weights = torch.stack([torch.ones_like(under), under]).to(error)
+        self.to(error.device)
+        # in place, as a replayed step adds to the tensors that it was captured with
+        self.sums.add_((weights @ error).double())
+        self.counts.add_(weights.sum(1).double())
+
+    def reset(self) -> None:
+        """Count anew."""
+        self.sums.zero_()
+        self.counts.zero_()
+
+    def percent(self) -> dict[str, float]:
+        """`state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden."""
+        return self._times(torch.ones(STATE_DIM))
+
+    def both(self, std: Tensor) -> dict[str, float]:
+        """The same, and after RAW_PREFIX in units of the simulator x 100, by the states' (4,) standard deviations."""
+        raw = self._times(std.cpu())
+        return self.percent() | {f"{RAW_PREFIX}{name}": value for name, value in raw.items()}
+
+    def _times(self, scale: Tensor) -> dict[str, float]:
+        named: dict[str, float] = {}
+        sums, counts = self.sums.cpu(), self.counts.cpu()
+        for number, suffix in enumerate(("", "_hidden")):
+            if counts[number]:
+                means = 100 * scale * sums[number] / counts[number]
+                named |= {f"{name}{suffix}": float(means[part].mean()) for name, part in COMPONENTS.items()}
+        return named
+
+
+def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
+    """Fit a probe on frozen (N, D) representations and their (N, 4) states."""
+    seed_networks(seed, "refit")
+    probe = StateProbe(features.shape[1]).to(features.device)
+    probe.standardise.fit(features)
+    optimiser = torch.optim.Adam(probe.parameters(), lr=_LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    generator = stream_generator(seed, "refit", "batches")
+    for _ in range(steps):
+        rows = torch.randint(len(features), (_BATCH,), generator=generator).to(features.device, non_blocking=True)
+        loss = (probe(features[rows]) - truth[rows]).square().mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return probe.eval()
+
 
 _SUPERVISED_RATE = 0.5
 """Share of the learning rate that supervised references take: at the whole one, two of three seeds predict the mean."""
@@ -102,24 +190,13 @@ class ProbedObjective(Objective):
         return found
 
 
-class MazeBatches:
-    """Uniform training windows of a maze's set."""
+class MazeBatches(WindowSampler):
+    """Uniform training windows of a maze's set: the first ones."""
 
     def __init__(self, data: MazeData, config: NavigationConfig) -> None:
-        self._data, self._batch_size = data, config.batch_size
-        self.draws = random_stream(config.seed, STAGE, "batches", device=data.dataset.t.device)
-
-    def sample(self) -> Windows:
-        """The next batch."""
-        return self._data.windows(self.draws.integers(self._data.training, self._batch_size))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume with the same batches."""
-        return {"generator": self.draws.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        self.draws.set_state(state["generator"])
+        draws = random_stream(config.seed, STAGE, "batches", device=data.dataset.t.device)
+        super().__init__(data.view, config.batch_size, config.window, draws)
+        self._count = data.training
 
 
 def make_trainer(data: MazeData, config: NavigationConfig, device: torch.device) -> tuple[Trainer, ProbedObjective]:

@@ -15,9 +15,8 @@ from torch import Tensor
 from vd4rl_pomdp.core.errors import UserError, refuse_unknown
 from vd4rl_pomdp.core.types import Windows, previous, row_key
 from vd4rl_pomdp.envs import Info
-from vd4rl_pomdp.studies.theory.gallery import WORLDS
 from vd4rl_pomdp.studies.theory.law import Law, joint_law
-from vd4rl_pomdp.studies.theory.world import World
+from vd4rl_pomdp.studies.theory.world import WORLDS, World
 
 
 class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
@@ -67,10 +66,7 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
         self._symbol = self._draw(self.world.emission[self._pair])
         obs = np.zeros(self.observation_space.shape or (), np.uint8)
         obs[self.world.symbols.index(self._symbol)] = 255
-        return obs, self._info()
-
-    def _info(self) -> Info:
-        return {"state": self._pair[0], "exogenous": self._pair[1]}
+        return obs, {"state": self._pair[0], "exogenous": self._pair[1]}
 
 
 @dataclass(frozen=True)

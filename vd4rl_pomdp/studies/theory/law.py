@@ -124,7 +124,7 @@ def joint_law(world: World, variables: Iterable[Variable]) -> Law:
         walk.keep(kinds)
         if row < rows - 1 or "a" in kinds:
             walk.act("a" in kinds)
-    walk.forget_pair()
+    walk.merge(walk.columns)  # sums out the last pair
     names = {"s": world.states, "xi": world.exogenous, "o": world.symbols, "a": world.actions}
     return Law(tuple(wanted), np.stack(walk.columns, 1), walk.counts, names)
 
@@ -183,11 +183,7 @@ class _Walk:
         self.s = self.step[self.s, action]
         self.columns += [action] * wanted
         self.xi = self._branch(self.drift, self.xi)
-        self._merge([*self.columns, self.s, self.xi])
-
-    def forget_pair(self) -> None:
-        """Sum out the last pair."""
-        self._merge(self.columns)
+        self.merge([*self.columns, self.s, self.xi])
 
     def _branch(self, table: _Table, row: np.ndarray) -> np.ndarray:
         """Split every sequence by what may come next, by its row of a table; returns each branch's entry."""
@@ -198,7 +194,8 @@ class _Walk:
         self.counts = self.counts[parent] * weights[row, nth]
         return table.entries[row, nth]
 
-    def _merge(self, keys: list[np.ndarray]) -> None:
+    def merge(self, keys: list[np.ndarray]) -> None:
+        """Add up sequences that are alike in some columns."""
         ids, first = number_rows(keys)
         counts = np.zeros(len(first), self.counts.dtype)
         np.add.at(counts, ids, self.counts)

@@ -10,20 +10,6 @@ from typing import Any
 
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash, compare
-from vd4rl_pomdp.studies.theory.gallery import (
-    WORLDS,
-    alternator,
-    counterexample,
-    echo,
-    flicker,
-    hidden_switch,
-    idle,
-    ladder,
-    momentum,
-    switch,
-    toggle,
-    variants,
-)
 from vd4rl_pomdp.studies.theory.partition import (
     Relation,
     discards_noise,
@@ -33,7 +19,27 @@ from vd4rl_pomdp.studies.theory.partition import (
     state_relation,
 )
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import Action, AgentState, World, diameter, future_memory, past_memory, period
+from vd4rl_pomdp.studies.theory.world import (
+    WORLDS,
+    Action,
+    AgentState,
+    World,
+    alternator,
+    counterexample,
+    diameter,
+    echo,
+    flicker,
+    future_memory,
+    hidden_switch,
+    idle,
+    ladder,
+    momentum,
+    past_memory,
+    period,
+    switch,
+    toggle,
+    variants,
+)
 
 MAX_K = 10
 GAPS = 4
@@ -41,7 +47,11 @@ GAPS = 4
 
 
 def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Action, ...], AgentState]]:
-    """Every (s_t, (a_t..a_{t+k-1}), s_{t+k})."""
+    """Every (s_t, (a_t..a_{t+k-1}), s_{t+k}).
+
+    The paper's counterexample is about these (section 3.2 and appendix): it generates all of them for k = 1..10 and
+    asks, for each pair of states, how the first action is distributed.
+    """
     found = []
     for start in world.states:
         for actions in product(world.actions, repeat=k):
