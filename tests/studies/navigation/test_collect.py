@@ -12,12 +12,12 @@ from vd4rl_pomdp.data import open_dataset, shards
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.mazes import MAZES
-from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, _explore, _Job, _roll_out, collect
+from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, _explore, _Job, _roll_out, collect
 
 
 def small(out: Path, **changes: object) -> MazeCollectConfig:
     given = {"maze": "three_curtains", "out": out, "trajectories": 4, "trajectory_rows": 30, "workers": 1}
-    return replace(PRESETS["cpu"], **(given | {"trajectories_per_shard": 2} | changes))
+    return MazeCollectConfig.of("cpu", **(given | {"trajectories_per_shard": 2} | changes))
 
 
 def hashes(folder: Path) -> dict[str, str]:
