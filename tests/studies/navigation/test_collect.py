@@ -112,7 +112,7 @@ def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones()
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"maze": "spiral"}, "unknown maze 'spiral'"),
+        ({"maze": "spiral"}, "unknown --maze 'spiral'"),
         ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
         ({"trajectory_rows": 2**20 + 1}, "--trajectory-rows is 1048577"),
         ({"action_repeat": 0}, "--action-repeat is 0"),

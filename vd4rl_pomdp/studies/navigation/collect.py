@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 
-from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
+from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside, refuse_unknown
 from vd4rl_pomdp.core.options import StageConfig
 from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
@@ -68,7 +68,7 @@ class MazeCollectConfig(StageConfig):
     def check(self) -> None:
         """Raise UserError for settings that make no set."""
         super().check()
-        get_maze(self.maze)
+        refuse_unknown("--maze", self.maze, MAZES)
         refuse_outside(
             self, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
             seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
