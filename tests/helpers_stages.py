@@ -1,6 +1,7 @@
 """The stages in their smallest size, cut and whole, and what their folders hold."""
 
 import hashlib
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,20 @@ import torch
 
 import finetune.config
 import pretrain.config
+from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 
 VARYING = ("timing.json", "pretrain_timing.json", "machine.json")
+
+
+def option_names() -> set[str]:
+    """Names of the options of all parts that there are."""
+    kinds, found = [Options], set[str]()
+    while kinds:
+        kind = kinds.pop()
+        kinds += kind.__subclasses__()
+        found |= {field.name for field in fields(kind)}
+    return found
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -18,8 +18,8 @@ import vd4rl_pomdp.envs
 import vd4rl_pomdp.nn.frame  # noqa: F401 (registers its kind of part)
 from finetune.config import FinetuneConfig
 from pretrain.config import PretrainConfig
+from tests.helpers_stages import option_names
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.core.options import option_names
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig

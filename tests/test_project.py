@@ -168,7 +168,7 @@ def test_every_flag_of_the_table_of_choices_exists():
 
     from finetune.config import FinetuneConfig
     from pretrain.config import PretrainConfig
-    from vd4rl_pomdp.core.options import option_names
+    from tests.helpers_stages import option_names
 
     settings = {f.name for config in (PretrainConfig, FinetuneConfig) for f in fields(config)} | option_names()
     flags = {name.replace("_", "-") for name in settings}
@@ -180,8 +180,8 @@ def test_every_flag_of_the_table_of_choices_exists():
 def test_every_flag_of_the_navigation_page_exists():
     from dataclasses import fields
 
+    from tests.helpers_stages import option_names
     from vd4rl_pomdp.cli.sweeps import RunCommand
-    from vd4rl_pomdp.core.options import option_names
     from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
     from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 

@@ -27,7 +27,6 @@ from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 
-EPISODES = 200
 CORES = 2
 RETURNS = ("task", "quality", "episode", "return")
 COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
@@ -44,6 +43,8 @@ class Config:
     tasks: tuple[str, ...] = tuple(TASKS)
     qualities: tuple[str, ...] = tuple(SET_QUALITIES)
     """One whose actor does not ship is left out."""
+    episodes: int = 200
+    """Episodes of each set."""
     timed_episodes: int = 4
     """Episodes of the short rendered collection that is timed for each task."""
     workers: int = 0
@@ -52,7 +53,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Play and time what the table lacks, and write it again."""
-    refuse_outside(config, timed_episodes=(1, MOST_EPISODES), workers=0)
+    refuse_outside(config, episodes=(1, MOST_EPISODES), timed_episodes=(1, MOST_EPISODES), workers=0)
     for task, quality in product(config.tasks, config.qualities):
         TASKS.named(task)
         refuse_unknown("quality", quality, SET_QUALITIES)
@@ -62,10 +63,10 @@ def main(config: Config) -> None:
     for task, quality in product(config.tasks, config.qualities):
         if not ships(task, quality):
             continue
-        full = CollectConfig(task, quality, Path(), EPISODES, workers=config.workers)  # type: ignore[arg-type]
+        full = CollectConfig(task, quality, Path(), config.episodes, workers=config.workers)  # type: ignore[arg-type]
         name, hashes = f"{task} {quality}", actor_hashes(full)
         others = [row for row in returns if (row["task"], row["quality"]) != (task, quality)]
-        if actors.get(name) != hashes or len(others) == len(returns):
+        if actors.get(name) != hashes or len(returns) - len(others) != config.episodes:
             played = [float(rollout["reward"].sum()) for rollout in play(full)]
             mine = [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in enumerate(played)]
             returns, actors[name] = others + mine, hashes

@@ -152,7 +152,7 @@ def test_a_missing_extra_ends_in_one_line_that_names_it(tmp_path):
 
 
 def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():
-    line, environment = [sys.executable, "-m", "vd4rl_pomdp.cli"], os.environ | {"PYTHONIOENCODING": "ascii"}
+    line, environment = [sys.executable, "-m", "vd4rl_pomdp"], os.environ | {"PYTHONIOENCODING": "ascii"}
     refused = subprocess.run([*line, "data", "check", "ζ"], capture_output=True, env=environment)
     assert (refused.returncode, refused.stderr.count(b"\n")) == (2, 1)
     assert refused.stderr.startswith(b"error: \\u03b6: no such folder")

@@ -228,6 +228,10 @@ def test_a_damaged_episode_is_named_and_nothing_is_left_behind(changed, message,
     assert "npz: episode 1: " in line
     assert message in line
     assert not (tmp_path / "new").exists()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SystemExit):
+        main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "empty")])
+    assert list((tmp_path / "empty").iterdir()) == [], "a folder of the user's own stays"
 
 
 def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):

@@ -5,8 +5,9 @@ import pytest
 from finetune.config import FinetuneConfig, as_trained
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
+from tests.helpers_stages import option_names
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import NO_OPTIONS, flat, option_names
+from vd4rl_pomdp.core.options import NO_OPTIONS, flat
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
 

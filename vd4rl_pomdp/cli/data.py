@@ -86,7 +86,7 @@ def import_set(
 @command
 def export_set(
     format: tyro.conf.Positional[str],
-    path: tyro.conf.Positional[Path],
+    set: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     size: int | None = None,
 ) -> None:
@@ -94,26 +94,26 @@ def export_set(
 
     Args:
         format: The format's name, as `vd4rl-pomdp list` shows them.
-        path: Folder of shards.
+        set: Folder of shards.
         out: Folder to write.
         size: Height and width to which frames are resized, by area; default: their own.
     """
     from vd4rl_pomdp.data.transfer import export_set
 
-    export_set(format, path, out, size)
+    export_set(format, set, out, size)
     print(f"exported to {out}")
 
 
 @command
-def card(path: tyro.conf.Positional[Path]) -> None:
+def card(set: tyro.conf.Positional[Path]) -> None:
     """Write a set's data card, card.md and card.png, into its folder; `data collect` does so itself.
 
     Args:
-        path: Folder of shards.
+        set: Folder of shards.
     """
     from vd4rl_pomdp.data.card import write_card
 
-    print(f"card: {write_card(path)}")
+    print(f"card: {write_card(set)}")
 
 
 def view(words: list[str], program: str) -> None:
@@ -124,39 +124,39 @@ def view(words: list[str], program: str) -> None:
 
 
 @command
-def check(path: tyro.conf.Positional[Path], json: bool = False) -> None:
+def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
     """Validate a set: format, episodes, checksums, and that its actions replay to its rewards.
 
     Args:
-        path: Folder of shards.
+        set: Folder of shards.
         json: Print one JSON object.
     """
     from vd4rl_pomdp.data.check import check_dataset
 
-    result = check_dataset(path)
+    result = check_dataset(set)
     show(result, json)
     error = result["replay_max_error"]
     if error is not None and error > REPLAY_TOLERANCE:
         raise UserError(
-            f"{path}: stored actions do not replay to what is stored (largest difference {error}, where "
+            f"{set}: stored actions do not replay to what is stored (largest difference {error}, where "
             f"{REPLAY_TOLERANCE} would be rounding)"
         )
 
 
 @command
-def parity(path: tyro.conf.Positional[Path | None] = None, json: bool = False) -> None:
+def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) -> None:
     """Compare rendered canary frames with golden ones, and a data set's background with the environment's.
 
     Args:
-        path: A data set, whose background decides; without one the canaries do.
+        set: A data set, whose background decides; without one the canaries do.
         json: Print one JSON object.
     """
     from vd4rl_pomdp.data.parity import check_parity
 
-    result = check_parity(path)
+    result = check_parity(set)
     show(result, json)
-    if not result["equal"] and path:
-        raise UserError(f"the environment shows another background than {path}: see `background` above")
+    if not result["equal"] and set:
+        raise UserError(f"the environment shows another background than {set}: see `background` above")
     if not result["equal"]:
         raise UserError(
             f"{result['render']['gl_renderer']} draws other pixels than the golden frames' software renderer did: name "

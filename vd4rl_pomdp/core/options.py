@@ -211,13 +211,3 @@ def refuse_options(kind: Any, base: type[Options] = Options) -> None:
             f"its options are {kind!r}: name a dataclass that is derived from {base.__module__}.{base.__name__}"
         )
     flat(kind.fill({}))
-
-
-def option_names() -> set[str]:
-    """Names of the options of all parts that there are."""
-    kinds, found = [Options], set[str]()
-    while kinds:
-        kind = kinds.pop()
-        kinds += kind.__subclasses__()
-        found |= {field.name for field in fields(kind)}
-    return found

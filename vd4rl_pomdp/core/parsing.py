@@ -20,6 +20,7 @@ from vd4rl_pomdp.core.errors import UserError, flag_of
 from vd4rl_pomdp.core.options import StageConfig
 
 Stage = TypeVar("Stage", bound=StageConfig)
+_TYRO = tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName
 
 
 def parse(config: Any, words: list[str], program: str, default: Any = None) -> Any:
@@ -41,7 +42,7 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
     shown = io.StringIO()
     try:
         with contextlib.redirect_stderr(shown):
-            parsed = tyro.cli(config, args=words, prog=program, config=(tyro.conf.OmitArgPrefixes,), **options)
+            parsed = tyro.cli(config, args=words, prog=program, config=_TYRO, **options)
     except SystemExit as end:
         if end.code != 2:
             raise

@@ -85,13 +85,13 @@ def collect_set(
 def _claim(out: Path, settings: dict[str, Any], stored: dict[str, Any], whole: bool) -> None:
     """Raise UserError unless a folder is free, or holds this set, begun by this code; a whole one stays what it is."""
     if not stored and holds_anything(out):
-        raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
+        raise UserError(f"{out}: is not empty and holds no collected set; choose another folder")
     if stored and (others := differing(stored, settings)):
-        raise UserError(f"{out}: holds a set collected with another {', '.join(others)}; choose another --out")
+        raise UserError(f"{out}: holds a set collected with another {', '.join(others)}; choose another folder")
     if stored and not whole and (parts := of_other_code(stored, settings)):
         raise UserError(
             f"{out}: was begun before the code of {parts[0]} changed, and is not whole; put that back, or choose "
-            "another --out"
+            "another folder"
         )
 
 
@@ -104,7 +104,7 @@ def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]
         drew, here = (told.get("gl_renderer") or "another renderer" for told in (before, now))
         raise UserError(
             f"{out}: its shards so far were drawn by {drew}, and {here} draws other pixels: go on on a machine like "
-            "the first, or choose another --out"
+            "the first, or choose another folder"
         )
     return now
 

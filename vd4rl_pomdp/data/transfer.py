@@ -129,7 +129,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
             progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
     # its lock keeps the hidden folder of another process from being removed
-    with _without_a_trace(hidden), disk_errors(out), owned(hidden), progress:
+    with _without_a_trace(hidden, True), disk_errors(out), owned(hidden), progress:
         shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was killed
         try:
             lost = form.write(hidden / "set", out, replace(opened, read=read))
@@ -142,9 +142,9 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
 
 
 @contextmanager
-def _without_a_trace(folder: Path) -> Iterator[None]:
-    """In the end a folder, and those above it that were made within, are removed if they are empty."""
-    made = [folder, *(place for place in folder.parents if not place.exists())]
+def _without_a_trace(folder: Path, ours: bool = False) -> Iterator[None]:
+    """In the end a folder and those above it are removed if they are empty and were made within, or it is `ours`."""
+    made = [one for one in (folder, *folder.parents) if not one.exists() or (ours and one == folder)]
     try:
         yield
     finally:

@@ -29,7 +29,7 @@ def refuse_inside(out: Path) -> None:
     """Raise UserError if a file or folder to write lies inside a run, a policy, an encoder or a data set."""
     for folder in Path(os.path.realpath(out)).parents:  # unlike resolve, takes a link to itself as it is
         if what := kept_in(folder):
-            raise UserError(f"{out}: lies inside {folder}, which holds {what}; choose another --out")
+            raise UserError(f"{out}: lies inside {folder}, which holds {what}; choose another folder")
 
 
 def refuse_kept(out: Path) -> None:

@@ -84,8 +84,7 @@ def _info(folder: Path) -> dict[str, Any]:
     """What meta/info.json tells."""
     path = folder / "meta" / "info.json"
     if not path.is_file():
-        fetch = "`hf download --repo-type dataset NAME --local-dir FOLDER` fetches one"
-        raise UserError(f"has no meta/info.json, so it is no LeRobot set on this disk; {fetch}")
+        raise UserError("has no meta/info.json, so it is no LeRobot set on this disk; `hf download` fetches one")
     info = read_json(path)
     if not (version := str(info.get("codebase_version"))).startswith("v3."):
         raise UserError(f"is in the format {version}, not v3; convert_dataset_v21_to_v30 of LeRobot converts it")
@@ -232,9 +231,8 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
             film = folder / _VIDEO.format(video_key=_PICTURE, **_numbered("", number))
             _encode(film, pictures)
             if number % 10 == 0:
-                change = np.abs(
-                    _filmed(film, columns["timestamp"].astype(float), _FPS).astype(np.int16) - rows[FRAMES_KEY]
-                )
+                seen = _filmed(film, columns["timestamp"].astype(float), _FPS)
+                change = np.abs(seen.astype(np.int16) - rows[FRAMES_KEY])
                 changes.append((change.mean(), change.max()))
             where = _numbered("", number) | {"from_timestamp": 0.0, "to_timestamp": len(pictures) / _FPS}
             place |= {f"videos/{_PICTURE}/{name}": value for name, value in where.items()}
@@ -371,6 +369,4 @@ def _numbered(prefix: str, number: int) -> dict[str, Any]:
 
 
 LEROBOT = DataFormat("LeRobot's sets, version 3; written with PNG pictures", read_lerobot, write_lerobot)
-LEROBOT_VIDEO = DataFormat(
-    "LeRobot's sets, version 3; written with video", read_lerobot, partial(write_lerobot, video=True)
-)
+LEROBOT_VIDEO = DataFormat("LeRobot's sets, version 3; with video", read_lerobot, partial(write_lerobot, video=True))
