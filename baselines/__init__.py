@@ -1,6 +1,6 @@
-"""Baselines, one file each, on the library's contracts."""
+"""Baseline methods, one file each, built on `vd4rl_pomdp.nn.objective`."""
 
-import vd4rl_pomdp  # noqa: F401, before torch: it says how torch's threads wait
+import vd4rl_pomdp  # noqa: F401, before torch: it configures how torch's threads wait
 from baselines.acdf import ACDF, ACDFOptions
 from baselines.acro import ACRO, ACROOptions
 from baselines.curl import CURL

@@ -1,3 +1,3 @@
 """Stage one: representations from pixels and actions alone."""
 
-import vd4rl_pomdp  # noqa: F401, before torch: it says how torch's threads wait
+import vd4rl_pomdp  # noqa: F401, before torch: it configures how torch's threads wait

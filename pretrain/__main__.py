@@ -1,4 +1,4 @@
-"""`python -m pretrain` is `vd4rl-pomdp pretrain`."""
+"""`python -m pretrain`: the same as `vd4rl-pomdp pretrain`."""
 
 import sys
 

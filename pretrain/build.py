@@ -1,4 +1,4 @@
-"""From a training's settings to its objective."""
+"""Build the objective and its encoder from a training config."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vd4rl_pomdp.nn.objective import ActionOptions, Objective
 
 
 def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | None:
-    """What the action head of a config's method predicts, None for a method that has none.
+    """Build the action target; None if the method predicts no actions.
 
     Args:
         config: the run's settings.
@@ -30,7 +30,7 @@ def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | 
     options = config.options
     if not isinstance(options, ActionOptions):
         return None
-    # K-means of other seeds ends in other codes: they belong to what varies from seed to seed
+    # K-means is seeded by the run: the codes it finds are part of the variance between seeds
     return make_action_target(options.action_target, actions, flat(options).get("codes", 0), config.seed)
 
 
@@ -41,14 +41,14 @@ def build_objective(
     states: StateScale | None = None,
     observation: tuple[int, int] = (3 * FRAME_STACK, FRAME_SIZE),
 ) -> Objective:
-    """Build the objective of a config, with an encoder of its own.
+    """Build the objective of a config, with a new encoder.
 
     Args:
         config: the run's settings.
-        action_dim: width of actions.
+        action_dim: action dimension A.
         target: from `build_target`.
-        states: scale of the simulator's states, where they are read or regressed.
-        observation: channels and size of an observation of pixels.
+        states: scale of the simulator states; needed if states are an input or a regression target.
+        observation: channels and image size of pixel observations, such as (9, 84).
     """
     method, memory = METHODS.named(config.method), {}
     if method.reads_state or config.frame_encoder == STATE:
@@ -74,7 +74,7 @@ def build_objective(
 
 
 def _state_shape(config: TrainingConfig, states: StateScale) -> dict[str, Any]:
-    """The encoder of simulator states: handed through, perhaps with noise, or standardised with coordinates hidden."""
+    """`EncoderConfig` fields for state input: raw, with noise added, or standardised with coordinates hidden."""
     options = config.options
     told: dict[str, Any] = {}
     if isinstance(options, StateOptions) and (options.pose_noise or options.velocity_noise):

@@ -1,4 +1,4 @@
-"""Settings of the pretraining stage and its presets; what it shares with training on mazes."""
+"""Config of the pretraining stage and its presets, and the base config that it shares with maze training."""
 
 from __future__ import annotations
 
@@ -23,60 +23,60 @@ from vd4rl_pomdp.runs.metrics import WandbMode
 
 @dataclass(frozen=True)
 class HiddenOptions(Options):
-    """Options of `--frame-encoder state`, which reads the simulator's standardised states in place of pixels."""
+    """Options of `--frame-encoder state`, which reads standardised simulator states instead of pixels."""
 
     hidden_share: float = 0.0
-    """Share of a state's coordinates that are hidden, drawn anew in every row."""
+    """Probability of hiding each state coordinate, resampled at every row (0.3 hides 30%)."""
 
     limits: ClassVar[Limits] = {"hidden_share": (0, 1)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig(StageConfig):
-    """Settings of every training of an objective."""
+    """Settings shared by everything that trains an objective."""
 
     data: Path = Path()
-    """Folder of the data set."""
+    """Data set folder."""
     out: Path = Path()
     """Run folder; re-run the same command to resume."""
     method: str = "mik+a"
-    """Objective to train; `vd4rl-pomdp list` shows all."""
+    """Method to train; `vd4rl-pomdp list` shows all."""
     seed: int = 0
-    """Seed of everything that is drawn: networks, batches, corruption, exogenous noise."""
+    """Random seed of networks, batches, corruption and exogenous noise."""
     steps: int = 50_000
     """Gradient steps."""
     batch_size: int = 16
-    """Windows in a batch."""
+    """Windows per batch."""
     window: int = 32
-    """Rows of a window."""
+    """Rows per window."""
     learning_rate: float = 3e-4
-    """Adam's learning rate."""
+    """Adam learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small, mixer, or
-    pretrained (a frozen image model); or state, the simulator's, in place of pixels."""
+    """Frame encoder: drq, nature (much cheaper), nature_half (nature at half resolution), small, mixer or pretrained (a
+    frozen image model); state reads the simulator state instead of pixels."""
     precision: Precision = "fp32"
-    """Precision of products: fp32, tf32 (on a GPU), or bf16 autocast."""
+    """Precision of matrix products: fp32, tf32 (on a GPU), or bf16 autocast."""
     device: str = "auto"
     """auto, cpu or cuda."""
     log_every: int = 50
-    """Steps that a row of metrics averages over."""
+    """Log the mean of the metrics every this many steps."""
     checkpoint_every: int = 500
-    """Steps between two checkpoints."""
+    """Steps between checkpoints."""
     wandb: WandbMode = "off"
-    """Mirror metrics to wandb: off, offline or online."""
+    """Log metrics to wandb: off, offline or online."""
     tensorboard: bool = False
-    """Mirror metrics to TensorBoard, in OUT/tensorboard."""
+    """Log metrics to TensorBoard, in OUT/tensorboard."""
     options: Annotated[Options, tyro.conf.arg(name="method")] = NO_OPTIONS
-    """What the chosen method can be told."""
+    """Options of the chosen method."""
     memory: Options = NO_OPTIONS
-    """The encoder's memory, where it has one."""
+    """Options of the encoder's memory, if it has one."""
     frame: Annotated[Options, tyro.conf.arg(name="frame-encoder")] = NO_OPTIONS
-    """What the chosen frame encoder can be told."""
+    """Options of the chosen frame encoder."""
 
     choosers: ClassVar[tuple[str, ...]] = ("method", "frame_encoder", "action_target")
 
     def check(self) -> None:
-        """Refuse settings that cannot work, before anything is read or written."""
+        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, log_every=1, checkpoint_every=1
@@ -87,17 +87,17 @@ class TrainingConfig(StageConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig(TrainingConfig):
-    """Settings of `vd4rl-pomdp pretrain`. What --method, --corruption, --frame-encoder, --action-target and --history
-    choose decides which flags there are: name them before --help."""
+    """Pretrain an encoder. Which flags exist depends on --method, --corruption, --frame-encoder, --action-target and
+    --history: put these before --help to see the flags of your choice."""
 
     task: str = ""
-    """The set's task, where neither its shards nor its folder's name tell."""
+    """Task of the data set; needed only if neither its shards nor its folder name state it."""
     shift: int = 4
-    """Random shift in pixels; whether observations or windows share one is the method's choice."""
+    """Largest random shift in pixels; the method decides whether a window or each observation is shifted as one."""
     history: str = "method"
-    """Memory of the encoder: method for the method's own (mostly gru, or none), or a memory's name, such as gru."""
+    """Memory of the encoder, such as gru, or none; method uses the method's default."""
     corruption: CorruptionConfig = NO_CORRUPTION
-    """What makes the observations partial."""
+    """Corruption that makes the observations partial."""
 
     choosers: ClassVar[tuple[str, ...]] = (*TrainingConfig.choosers, "history", "corruption")
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
@@ -117,11 +117,11 @@ class PretrainConfig(TrainingConfig):
             "checkpoint_every": 10,
         },
     }
-    """`paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
+    """`paper`: the paper's settings. `cpu`: sized for two cores. `smoke`: a test run of a few seconds."""
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of method, memory, frame encoder and corruption."""
+        """Fill the options of method, memory, frame encoder and corruption from flag values."""
         method = METHODS.named(values["method"])
         return {
             "options": method.options.fill(values),
@@ -131,7 +131,7 @@ class PretrainConfig(TrainingConfig):
         }
 
     def check(self) -> None:
-        """Refuse settings that cannot work, before anything is read or written."""
+        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         method = METHODS.named(self.method)
         refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
@@ -143,7 +143,7 @@ class PretrainConfig(TrainingConfig):
 
 
 def history_of(name: str, method: Method, history: str) -> str:
-    """Name of the memory of a method's encoder, or none; one that it cannot have raises UserError."""
+    """Resolve --history to a memory's name or "none"; UserError if the method does not allow that memory."""
     if history == "method":
         return method.history
     if method.end_to_end or method.reads_state:
@@ -156,12 +156,12 @@ def history_of(name: str, method: Method, history: str) -> str:
 
 
 def memory_options(history: str, values: Mapping[str, Any]) -> Options:
-    """Options of the memory called `history`; none for `none`."""
+    """Fill the options of the memory `history` from flag values; no options for "none"."""
     kind = Options if history == "none" else MEMORIES.named(history).options
     return kind.fill(values)
 
 
 def frame_options(method: Method, values: Mapping[str, Any]) -> Options:
-    """Options of the frame encoder that values name; none for a method that reads no pixels."""
+    """Fill the options of the chosen frame encoder from flag values; no options for a method that reads states."""
     kind = FRAME_ENCODERS.named(values["frame_encoder"]).options
     return Options() if method.reads_state else kind.fill(values)

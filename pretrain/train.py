@@ -1,6 +1,6 @@
-"""`vd4rl-pomdp pretrain`: train an encoder on a set, under a corruption, by a method.
+"""`vd4rl-pomdp pretrain`: train an encoder with a method on a data set, under a corruption.
 
-`Trainer` is the loop, of pixels, states and mazes alike.
+`Trainer` is the training loop; pixels, states and mazes all use it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STAGE = "pretrain"
 
 
 def pretrain(config: PretrainConfig) -> RunFolder:
-    """Run the stage, or resume it, and write `out/encoder`; returns the run's folder."""
+    """Run or resume pretraining and write `out/encoder`; returns the run folder."""
     config.check()
     refuse_inside(config.out)
     method, dataset = METHODS.named(config.method), open_dataset(config.data)
@@ -65,12 +65,12 @@ def pretrain(config: PretrainConfig) -> RunFolder:
 
 
 def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
-    """The objective of a config on a set, on the CPU; UserError where the two do not fit."""
+    """Build the objective of a config for a data set, on the CPU; UserError if config and data set do not fit."""
     method = METHODS.named(config.method)
     dataset.require_transitions()
     dataset.check_windows(config.window)
     refuse_outside(config, shift=(0, dataset.frame_size - 1))
-    # where a method reads states, pictures are for films alone, of the benchmark's size
+    # a method that reads states uses images only for videos, which have the benchmark's frame size
     check_corruption_fits(config.corruption, FRAME_SIZE if method.reads_state else dataset.frame_size)
     seed_networks(config.seed, STAGE)
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
@@ -80,7 +80,7 @@ def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
 
 
 def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective) -> WindowSampler:
-    """Windows of a set as the method is to see them, from the run's own random stream."""
+    """Sampler of the windows that the method trains on, shifted and corrupted; seeded by the run."""
     method, draws = METHODS.named(config.method), random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
     frame = objective.encoder.frame
     if isinstance(frame, StateFrame):
@@ -93,24 +93,24 @@ def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective)
 
 
 class StateWindowSampler(WindowSampler):
-    """Windows with the simulator's states of their rows, for losses that are told them."""
+    """Samples windows together with the simulator states of their rows, for losses that regress states."""
 
     def __init__(
         self, source: View, batch_size: int, length: int, draws: RandomStream, histories: bool, hold_out: bool
     ) -> None:
-        """See the class.
+        """Initialise.
 
         Args:
-            source: what is seen of a set.
-            batch_size: windows in a batch.
-            length: rows of a window.
-            draws: where they begin.
-            histories: whether they are histories instead, as `Method` says.
-            hold_out: whether the states of the episodes that a probe is tested on are NaN.
+            source: view of the data set.
+            batch_size: windows per batch.
+            length: rows per window.
+            draws: random stream of the first rows.
+            histories: sample histories up to the episode's end instead of windows; see `Method.histories`.
+            hold_out: set the states of the probe's test episodes to NaN, so that no loss sees them.
         """
         super().__init__(source, batch_size, length, draws)
         data = source.dataset
-        # kept apart from the windows of other methods, so that none of them can read a state by mistake
+        # a separate sampler, so that no other method can read a state by mistake
         self._states = data.states()
         if hold_out:
             test = torch.from_numpy(held_out(data.episode.cpu().numpy())).to(data.t.device)
@@ -118,12 +118,12 @@ class StateWindowSampler(WindowSampler):
         self._longest = data.longest_episode if histories else 0
 
     def sample(self) -> StateWindows:
-        """The next batch."""
+        """Next batch."""
         window = self._histories() if self._longest else super().sample()
         return StateWindows(**window, state=self._states[self.view.dataset.rows(window.key)])
 
     def _histories(self) -> Windows:
-        """From first rows, which are what an episode is played from, and from random ones, which are many more."""
+        """Half from an episode's first row, as in evaluation, half from a random row, for variety."""
         data = self.view.dataset
         row = data.transition_rows[self._draw(data.num_transitions)]
         whole = self.draws.uniform(len(row)) < 0.5
@@ -132,7 +132,7 @@ class StateWindowSampler(WindowSampler):
 
 
 def view_of(dataset: Dataset, config: PretrainConfig) -> View:
-    """What is seen of a set, shifted as the method has it."""
+    """View of a data set with the config's corruption and the method's kind of random shift."""
     shared = METHODS.named(config.method).shift
     if getattr(config.options, "shift_shared", False):
         shared = "window"
@@ -148,7 +148,7 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
     if dataset.task is not None and name != dataset.task:
         raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
     if dataset.imported and name not in TASKS:
-        return name  # an encoder needs no environment; what evaluates refuses the name
+        return name  # pretraining needs no environment; evaluation refuses an unknown task
     if (width := layout_of(TASKS.named(name)).action_dim) != dataset.action_dim:
         raise UserError(
             f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {width}; pass the right --task"
@@ -158,7 +158,7 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
 
 def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCard:
     losses = [row["action_loss"] for row in read_metrics(run.path / METRICS_FILE) if "action_loss" in row]
-    last_tenth = losses[-max(1, len(losses) // 10) :]  # the last row alone is noisy
+    last_tenth = losses[-max(1, len(losses) // 10) :]  # a single row would be noisy
     return EncoderCard(
         method=config.method,
         task=config.task,
@@ -175,7 +175,7 @@ def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCa
 
 
 class Trainer:
-    """Knows no method by name: sample, compute the loss, step. Resumes to the bit on a CPU."""
+    """Training loop for any objective: sample, compute the loss, step. On a CPU, resuming is bit-exact."""
 
     def __init__(
         self,
@@ -184,13 +184,13 @@ class Trainer:
         config: TrainingConfig,
         learning_rate: Callable[[int], float] | None = None,
     ) -> None:
-        """Nothing is trained yet.
+        """Set up the optimiser; no step is taken.
 
         Args:
-            objective: what is trained, on its device.
-            batches: on the same device.
+            objective: the module to train, already on its device.
+            batches: sampler on the same device.
             config: the stage's settings.
-            learning_rate: of a step, the first being 0; None: the config's for all.
+            learning_rate: schedule from step (starting at 0) to learning rate; None: the config's, constant.
         """
         self.objective, self.batches, self.config, self._learning_rate = objective, batches, config, learning_rate
         self.device = next(objective.parameters()).device
@@ -201,10 +201,10 @@ class Trainer:
         self._progress: float | Tensor = torch.zeros((), device=self.device) if self._replay.replays else 0.0
 
     def update(self) -> dict[str, Tensor]:
-        """One gradient step; returns the objective's scalars."""
+        """Take one gradient step; returns the objective's scalars to log."""
         progress = self.step / max(1, self.config.steps)
         if isinstance(self._progress, Tensor):
-            self._progress.fill_(progress)  # in place, for replayed steps
+            self._progress.fill_(progress)  # in place: a captured CUDA graph reads this tensor
         else:
             self._progress = progress
         if self._learning_rate is not None:
@@ -217,7 +217,7 @@ class Trainer:
         window = self.batches.sample()
         with autocast(self.device, self.config.precision):
             loss, logs = self.objective.loss(window, self._progress)
-        # outside of autocast, which is for forward passes alone
+        # outside autocast, which is meant for the forward pass only
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()
@@ -233,25 +233,25 @@ class Trainer:
         measures: Callable[[], dict[str, float]] = dict,
         also_at: int | None = None,
     ) -> None:
-        """Train up to `steps`, from the newest checkpoint if there is one.
+        """Train up to step `steps`, resuming from the newest checkpoint if there is one.
 
         Args:
-            run: where checkpoints and metrics go.
-            steps: the last step.
-            title: of the progress line.
-            labels: what names the run where it is tracked.
-            measures: numbers that a row of metrics has beside the means of the objective's scalars.
-            also_at: a step after which a row of metrics is written, too.
+            run: folder for checkpoints and metrics.
+            steps: total number of steps.
+            title: title of the progress bar.
+            labels: tags of the run for wandb and TensorBoard.
+            measures: called for extra values in each row of metrics, next to the objective's mean scalars.
+            also_at: log a row of metrics after this step, too.
         """
         with training(run, self, title, steps, labels=labels) as loop:
             for step in loop:
                 loop.add(self.update())
                 if loop.due(self.config.log_every) or step == also_at:
                     loop.log("loss", **measures())
-            loop.require_finite(self.objective)  # no later loss tells what the last step did
+            loop.require_finite(self.objective)  # no later loss would show that the last step diverged
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to resume to the bit."""
+        """Everything needed for a bit-exact resume."""
         return {
             "step": self.step,
             "objective": self.objective.state_dict(),

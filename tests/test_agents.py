@@ -74,9 +74,13 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
         with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
             load_agent(out)
         (out / name).write_bytes(whole)
-    write_json(out / "card.json", {"task": card["task"]})
-    with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
-        load_agent(out)
+    for damaged in (
+        {"task": card["task"]},
+        *(card | {name: None} for name in ("task", "method", "corruption", "sha256")),
+    ):
+        write_json(out / "card.json", damaged)
+        with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
+            load_agent(out)
 
 
 def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):

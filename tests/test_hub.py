@@ -121,8 +121,8 @@ def test_cards_on_the_hub_say_how_to_load_what_they_describe_and_under_which_lic
 def test_an_agent_comes_back_as_it_was_and_does_not_pass_for_an_encoder(hub, encoder, tmp_path):
     Policy(12, 6, 8).save(encoder.parent / "policy")
     write_rounded(encoder.parent, tmp_path / "agent")
-    about = {"task": CARD.task, "corruption": CARD.corruption, "run": "r00", "sha256": checksums(tmp_path / "agent")}
-    write_json(tmp_path / "agent" / "card.json", about)
+    about = {"task": CARD.task, "method": CARD.method, "corruption": CARD.corruption, "run": "r00"}
+    write_json(tmp_path / "agent" / "card.json", about | {"sha256": checksums(tmp_path / "agent")})
     push(encoder, ENCODER)
     push(tmp_path / "agent", ENCODER)  # replaces the encoder
     assert set(hub.files(WHERE[ENCODER])) == {*content(tmp_path / "agent"), "README.md", LISTING, ".gitattributes"}

@@ -31,7 +31,7 @@ from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.outputs import owned
-from vd4rl_pomdp.studies.navigation.collect import PRESETS
+from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
 from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX
@@ -272,7 +272,7 @@ def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_
 def test_a_set_that_another_process_collects_is_refused(tmp_path):
     configs = [
         (collect, CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),
-        (collect_maze, replace(PRESETS["smoke"], maze="no_curtain", out=tmp_path / "set", workers=1)),
+        (collect_maze, MazeCollectConfig.of("smoke", maze="no_curtain", out=tmp_path / "set", workers=1)),
     ]
     for run, config in configs:
         with owned(tmp_path / "set"), pytest.raises(UserError, match="set: is in use by process"):

@@ -1,4 +1,4 @@
-"""Every pretraining method by name. A method is one file and one entry here, or `METHODS.register` from anywhere."""
+"""Registry of pretraining methods. To add one: write a file and an entry here, or call `METHODS.register` anywhere."""
 
 from __future__ import annotations
 
@@ -33,39 +33,39 @@ from vd4rl_pomdp.nn.objective import ActionOptions, InverseOptions, Objective
 
 @dataclass(frozen=True)
 class Method:
-    """How to build an objective, and the encoder it trains."""
+    """How to build an objective and the encoder that it trains."""
 
     build: Callable[..., Objective]
-    """From (encoder, target, options, seed): an `Encoder`, the `ActionTarget` if its options are `ActionOptions` (else
-    None; the `StateScale` of the set if it regresses states), its options and the run's seed. An objective's class is
-    one."""
+    """Called with (encoder, target, options, seed); usually the objective's class. `target` is the `ActionTarget` if
+    the options are `ActionOptions`, the `StateScale` of the data set if `regresses_state`, else None."""
     history: str = "none"
-    """Name of its encoder's memory, or none; --history chooses another."""
+    """Default memory of the encoder, "none" for none; --history overrides it."""
     use_actions: bool = False
-    """Whether the memory reads past actions; without a memory of its own, under --history alone."""
+    """Whether the memory also reads past actions; for a method with history "none" it matters only with --history."""
     past: int | None = None
-    """Rows before t that a state is computed from unless the user chooses m; None: all."""
+    """Default of --m: rows before t that s_t is computed from, None for all."""
     shift: Sharing | Literal["own"] = "window"
-    """What shares one random shift: the observations of a window, or the frames of one observation, where what a window
-    shares would give the answer away, or where its authors have it so; own: the objective shifts by itself, and what it
-    is given is not shifted. An option `shift_shared` of its options, where it is True, makes it the window."""
+    """Unit of the random shift. "window": all observations of a window move together. "observation": each observation
+    moves independently, as its authors do, or because a shared shift would leak the answer to a contrastive loss.
+    "own": the objective shifts by itself and receives unshifted windows. `shift_shared=True` in the method's options
+    overrides this with "window"."""
     trained: bool = True
     """False for references that take no gradient step."""
     end_to_end: str = ""
-    """Fine-tuning algorithm that trains the encoder, too; empty for frozen encoders."""
+    """Fine-tuning algorithm that also trains the encoder; empty for frozen encoders."""
     reads_state: bool = False
-    """Whether it is given the simulator state in place of pixels."""
+    """Whether the encoder's input is the simulator state instead of pixels."""
     regresses_state: bool = False
-    """Whether its loss, and nothing else of it, is told the simulator states: its windows are `StateWindows`."""
+    """Whether the loss is computed from simulator states; its batches are then `StateWindows`."""
     histories: bool = False
-    """Whether these are histories up to their episodes' ends, shown by their first observation alone, whatever --window
-    is; half of them begin with an episode, the others at a random row."""
+    """Train on histories up to the episode's end instead of windows of --window rows; only the first observation is
+    used. Half of them start at an episode's first row, half at a random row."""
     least_batch: int = 1
-    """Windows that a batch holds at least: 2 where a loss tells those of one window from those of another."""
+    """Smallest --batch-size; 2 for losses that contrast windows with each other."""
     options: type[Options] = Options
-    """Class of its options."""
+    """Class of the method's options."""
     summary: str = ""
-    """One line that says what it is."""
+    """One-line description."""
 
 
 _OWN = {
@@ -177,4 +177,4 @@ METHODS: Registry[Method] = Registry(
     "a pretrain.objectives.Method",
     lambda name, part: refuse_options(part.options),
 )
-"""All methods. Packages offer theirs in the group of entry points `vd4rl_pomdp.methods`; each names a `Method`."""
+"""All methods. Other packages add a `Method` through the entry point group `vd4rl_pomdp.methods`."""

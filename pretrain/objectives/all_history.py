@@ -4,14 +4,14 @@
     AH           P(a_t | f(o_0..o_t), f(o_0..o_{t+k})),   k in 1..K
     AH+A         the same with actions: f(o_0, a_0, ..., a_{t-1}, o_t) and f(o_0, a_0, ..., a_{t+k-1}, o_{t+k})
 
-One forward GRU f gives both states, so the later one contains the earlier one's inputs. In AH+A it contains a_t as
-well: an encoder that only records actions reaches zero loss. The paper has it to show that, and so do we.
+One forward GRU f computes both states, so the later one contains the earlier one's inputs. In AH+A that includes a_t:
+an encoder that only records actions reaches zero loss. The paper includes AH+A to show this failure, and so do we.
 
 Authors' code: not published.
 
 Differences and readings:
-- no_history is the encoder e alone in the same loop: ACRO's mathematics under the paper's name for it.
-- The past begins at the window's first row, which carries no earlier action.
+- no_history is ACRO's loss under the paper's name: the memoryless encoder e in the same loop.
+- The past starts at the window's first row, which has no previous action.
 """
 
 from __future__ import annotations

@@ -2,24 +2,24 @@
 
     P(a_t | f(o_0, a_0, ..., a_{t-1}, o_t), b(o_{t+k}, a_{t+k}, o_{t+k+1}, ...)),   k in 1..K
 
-A forward GRU f summarises the past, a backward GRU b the future from row t+k on. The k steps between are masked by
-never being read: a pair takes f's state of row t and b's of row t+k. The loss on them is `InverseObjective.loss_of`.
-Only f is kept. "+A" (actions in both) is the field `use_actions` of the encoder.
+A forward GRU f summarises the past and a backward GRU b the future from row t+k on. A pair uses f's state at row t and
+b's at row t+k, so the steps in between are masked by never being read. The loss is `InverseObjective.loss_of`. Only f
+is kept after pretraining. "+A" (both GRUs also read actions) is the encoder's field `use_actions`.
 
 Authors' code: not published.
 
 Differences and readings:
-- The paper's rows are (o_t, a_{t-1}): the future's first, (o_{t+k}, a_{t+k-1}), hands b the last masked action, which
-  for k = 1 is the target. Here b reads (o_j, a_j) for j >= t+k, so that it never sees a_t..a_{t+k-1}.
-  `literal_future` restores the literal rows, to measure what they do.
-- An observation is a stack of the frames j-2..j, so that o_{t+k} shows up to two frames of masked steps, in the paper's
-  setting, too. `future_frames` blanks them: b's state of row t+k then reads that row with its newest frame alone, the
-  next one without its oldest.
-- The future of row h is printed as rows min(h+n, H) to H; here it begins at h = t+k, as in the paper's proof.
-- An episode's last row has no action: b reads zeros and a flag there.
-- The future reaches to the window's end, or n rows beyond t+k (the paper's n is not stated for these experiments);
-  the past to the window's start, or m rows before t. Of n+1 rows of the future b reads n+1 actions, not n: each row is
-  whole, and given s_{t+k} the last action says nothing more about a_t.
+- The paper's rows are (o_t, a_{t-1}). Read literally, the future's first row (o_{t+k}, a_{t+k-1}) gives b the last
+  masked action, which is the target if k = 1. Here b reads (o_j, a_j) for j >= t+k and never sees a_t..a_{t+k-1}.
+  `literal_future` restores the paper's rows, to measure that leak.
+- Observation o_j stacks frames j-2..j, so o_{t+k} shows up to two frames of masked steps; this holds in the paper's
+  setting, too. `future_frames` blanks them: for a pair (t, k), b reads row t+k with its newest frame only and row t+k+1
+  without its oldest frame.
+- The paper prints the future of row h as rows min(h+n, H) to H; here it begins at h = t+k, as in the paper's proof.
+- An episode's last row has no action: b reads zeros there and a flag that says so.
+- The future extends to the window's end, or to n rows after t+k (the paper does not state n for these experiments);
+  the past extends to the window's start, or to m rows before t. With n+1 rows of future b reads n+1 actions, not n:
+  given s_{t+k} the last action carries no further information about a_t.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class MaskedOptions(InverseOptions):
     """Options of MIK."""
 
     n: int | None = None
-    """Rows after t+k that the future encoder reads; None: all to the window's end."""
+    """Rows after t+k that the future encoder reads; None: all up to the window's end."""
 
     future_frames: Literal["all", "newest"] = "all"
-    """Frames of the future's first observations: all, of which up to two are of masked steps, or newest, where those
-    before t+k are blanked."""
+    """Frames that the future shows: all, up to two of which belong to masked steps, or newest, which blanks the frames
+    before t+k."""
 
     limits: ClassVar[Limits] = {"n": 0}
 
@@ -58,11 +58,11 @@ class MaskedActionOptions(MaskedOptions):
     """Options of MIK+A."""
 
     literal_future: bool = False
-    """Give the future encoder a_{t+k-1}, as the paper's rows (o_t, a_{t-1}) have it (a leak at k = 1)."""
+    """Also give the future encoder a_{t+k-1}, as in the paper's rows (o_t, a_{t-1}); at k = 1 this leaks the target."""
 
 
 class MaskedInverse(InverseObjective):
-    """MIK (an encoder that reads observations only) and MIK+A (one that reads actions too)."""
+    """MIK (the encoder reads observations only) and MIK+A (it also reads actions)."""
 
     def __init__(self, encoder: Encoder, target: ActionTarget, options: MaskedOptions, seed: int) -> None:
         shape = encoder.config
@@ -77,7 +77,7 @@ class MaskedInverse(InverseObjective):
                 "leave it out"
             )
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
-        # weights of its own: it reads time backwards, and only f is kept
+        # does not share f's weights: it reads time backwards, and only f is kept
         self.backward_memory = encoder.make_memory(inputs)
 
     def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
@@ -89,14 +89,17 @@ class MaskedInverse(InverseObjective):
             blanked = [self._future_rows(self.encoder.frame(obs), window) for obs in self._blanked(window.obs)]
             span = None if self.n is None else self.n + 1
             return past, run_over_versions(self.backward_memory, [*blanked, rows], window.length, span)
-        # b runs from the window's end down, so that its state of row t+k has met no row, and no action, before t+k:
-        # what a pair masks is never an input, where zeros in its place would be one
+        # b runs from the window's end backwards, so its state at row t+k depends on no row and no action before t+k.
+        # Masked rows are thus never an input; zeros in their place would be one.
         if self.n is None:
             return past, run_backward(self.backward_memory, rows, window.length)
         return past, run_over_next(self.backward_memory, rows, window.length, self.n + 1)
 
     def _blanked(self, obs: Tensor) -> list[Tensor]:
-        """Observations as a future's first row, its second, ...: without the frames of before the first."""
+        """Copies of `obs` for use as the future's first row, its second, ...: frames older than t+k are zeroed.
+
+        With stacks of 3 frames: [newest frame only, newest two frames].
+        """
         stack = self.encoder.frame_stack
         older = (3 * frames for frames in range(stack - 1, 0, -1))
         return [torch.cat([torch.zeros_like(obs[:, :, :c]), obs[:, :, c:]], dim=2) for c in older]
@@ -108,11 +111,11 @@ class MaskedInverse(InverseObjective):
             action, known = window.prev_action, torch.ones_like(window.has_action)
         else:
             action, known = window.action, window.has_action
-        # an action of zeros can be taken: the flag tells it from none
+        # the flag distinguishes "no action" from an action of zeros
         return torch.cat([features, action.to(features), known[..., None].to(features)], dim=-1)
 
     def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
-        """Past up to t and future from t+k on; with actions a_j for j < t and j >= t+k."""
+        """Observations up to t and from t+k on; with actions, also a_j for j < t and j >= t+k."""
         observations, actions = self.past_visible(t)
         read = (rows if self.n is None else self.n + 1, self.backward_memory.reach or rows)
         end = min(rows, t + k + min(read))
@@ -123,6 +126,6 @@ class MaskedInverse(InverseObjective):
         return observations, actions
 
     def visible_frames(self, t: int, k: int, rows: int) -> set[int]:
-        """All of the stacks, or all but those of masked steps: the past's last stack shows what else is blanked."""
+        """Frames of the visible stacks; with `newest`, without those of the masked steps t+1..t+k-1."""
         frames = super().visible_frames(t, k, rows)
         return frames - set(range(t + 1, t + k)) if self.newest else frames

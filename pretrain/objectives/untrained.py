@@ -1,9 +1,9 @@
-"""References that make a table honest; no pretraining step is taken, their encoders are written as initialised.
+"""References without pretraining: their encoders are saved as initialised.
 
-random   stays as it is: the floor
-bc       is trained by fine-tuning, end to end, by behaviour cloning
-drq_bc   is trained by fine-tuning, end to end, by the critic's loss (DrQ-v2+BC of V-D4RL)
-state    is no network: the simulator state itself, a reference on sets that store it
+random   a frozen random encoder: the lower bound
+bc       trained end to end during fine-tuning, by behaviour cloning
+drq_bc   trained end to end during fine-tuning, by the critic's loss (DrQ-v2+BC of V-D4RL)
+state    no network: the simulator state itself, for data sets that store it
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from vd4rl_pomdp.nn.objective import Objective
 
 @dataclass(frozen=True)
 class StateOptions(Options):
-    """Options of the simulator state in place of an encoder."""
+    """Options of the `state` reference."""
 
     pose_noise: float = 0.0
-    """Normal noise on poses: its mean absolute value in percent of each one's standard deviation, as probes count."""
+    """Gaussian noise on poses: its mean absolute value, in percent of each coordinate's standard deviation (the unit of
+    probe errors)."""
     velocity_noise: float = 0.0
-    """The same on velocities."""
+    """The same for velocities."""
 
     limits: ClassVar[Limits] = {"pose_noise": (0, 1000), "velocity_noise": (0, 1000)}
 
 
 class Untrained(Objective):
-    """Trains nothing."""
+    """Objective without training."""
 
     def __init__(self, encoder: Encoder, target: ActionTarget, options: Options, seed: int) -> None:
         super().__init__()

@@ -44,7 +44,7 @@ SLIPS = [
     (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
     (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),
     (["evaluate", "nowhere", "--out", "new.csv"], "nowhere: holds no evaluated run"),
-    (["navigation", "collect"], "--maze"),
+    (["navigation", "collect", "--out", "set"], "unknown --maze"),
     (["report"], "no runs are named: name at least one"),
     (["report", "nowhere"], "nowhere: no such folder"),
     (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),

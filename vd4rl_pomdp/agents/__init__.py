@@ -90,7 +90,8 @@ def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
             f"the package ships {', '.join(shipped()) or 'none'}"
         )
     card = read_json(folder / CARD)
-    if not {"task", "corruption"} <= card.keys() or card.get("sha256") != checksums(folder):
+    about = read_json(folder / FILES[0]).get("pretrain", {}) if card.get("sha256") == checksums(folder) else {}
+    if not about or any(card.get(name) != about[name] for name in ("task", "method", "corruption")):
         raise UserError(f"{folder}: its files are not those that {CARD} tells of; take another copy")
     return folder, card
 

@@ -50,7 +50,7 @@ def apart(function: str, *arguments: Any, count: int = 1, **environment: str) ->
     """
     words = [sys.executable, "-c", _SERVE, json.dumps([function, *arguments])]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    processes = [subprocess.Popen(words, env=os.environ | environment, **pipes) for _ in range(count)]
+    processes: list[Any] = [subprocess.Popen(words, env=os.environ | environment, **pipes) for _ in range(count)]
     try:
         if not all(process.stdout.readline() for process in processes):
             raise WorkerDiedError("a measuring process ended without an answer")

@@ -49,8 +49,7 @@ from vd4rl_pomdp.runs.device import Precision, pick_device
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs
-from vd4rl_pomdp.studies.navigation.collect import PRESETS as SETS
-from vd4rl_pomdp.studies.navigation.collect import collect
+from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.data import MazeData, open_maze_set
 from vd4rl_pomdp.studies.navigation.train import make_trainer as make_maze_trainer
@@ -482,8 +481,7 @@ def maze_training() -> dict[str, float]:
     """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
-        collect(replace(SETS["smoke"], **shape))  # type: ignore[arg-type]
+        collect(MazeCollectConfig.of("smoke", maze="no_curtain", out=folder / "set", workers=1))
         config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
         data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
         trainer, _ = make_maze_trainer(data, config, pick_device("auto"))

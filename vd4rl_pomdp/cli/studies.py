@@ -10,7 +10,7 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.parsing import parse, parse_stage, with_presets
+from vd4rl_pomdp.core.parsing import parse, parse_stage
 from vd4rl_pomdp.runs import NAVIGATION_FILE
 
 
@@ -207,9 +207,9 @@ def certify(
 
 def navigation_collect(words: list[str], program: str) -> None:
     """Collect a maze's data."""
-    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, collect
+    from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
 
-    config = with_presets(MazeCollectConfig, PRESETS, words, program)
+    config = parse_stage(MazeCollectConfig, words, program)
     print(f"{len(collect(config))} shards in {config.out}")
 
 

@@ -8,7 +8,7 @@ import io
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError, flag_of
 from vd4rl_pomdp.core.options import StageConfig
 
 Stage = TypeVar("Stage", bound=StageConfig)
@@ -64,15 +64,6 @@ def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
     parsed: Stage = parse(config, words, program, config.of(**chosen, **required))
     parsed.check()
     return parsed
-
-
-def with_presets(config: type, presets: dict[str, Any], words: list[str], program: str) -> Any:
-    """Parse a config whose flag `--preset` chooses the defaults of all others."""
-    name = chosen_by(words, ["preset"]).get("preset", next(iter(presets)))
-    refuse_unknown("preset", name, presets)
-    default = presets[name]
-    missing = {f.name: tyro.MISSING for f in fields(config) if getattr(default, f.name) in (Path(), "")}
-    return parse(config, words, program, replace(default, **missing))
 
 
 def chosen_by(words: list[str], names: Iterable[str]) -> dict[str, str]:

@@ -12,13 +12,13 @@ from pretrain.config import PretrainConfig, history_of
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.core.options import flat, settings_of, words_of
-from vd4rl_pomdp.core.parsing import parse, parse_stage, with_presets
+from vd4rl_pomdp.core.parsing import parse, parse_stage
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.run import recipe
-from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
+from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
 from vd4rl_pomdp.studies.navigation.collect import collection as maze_collection
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
@@ -37,7 +37,7 @@ _PARSERS: dict[str, Callable[[list[str], str], Any]] = {
     "collect": partial(parse, CollectConfig),
     "pretrain": partial(parse_stage, PretrainConfig),
     "finetune": partial(parse_stage, FinetuneConfig),
-    "navigation_collect": partial(with_presets, MazeCollectConfig, PRESETS),
+    "navigation_collect": partial(parse_stage, MazeCollectConfig),
     "navigation_train": partial(parse_stage, NavigationConfig),
 }
 """Parser of each section's settings. It is the command's own, so a grid accepts and rejects what the command does, and

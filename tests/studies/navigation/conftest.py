@@ -1,9 +1,8 @@
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.studies.navigation.collect import PRESETS, collect
+from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
 
 
 @pytest.fixture(scope="session")
@@ -11,5 +10,5 @@ def maze_set(tmp_path_factory) -> Path:
     """Twelve short trajectories of three_curtains."""
     out = tmp_path_factory.mktemp("maze") / "three_curtains"
     shape = {"trajectories": 12, "trajectory_rows": 40, "trajectories_per_shard": 6, "workers": 1}
-    collect(replace(PRESETS["smoke"], maze="three_curtains", out=out, **shape))
+    collect(MazeCollectConfig.of("smoke", maze="three_curtains", out=out, **shape))
     return out

@@ -12,12 +12,12 @@ from vd4rl_pomdp.data import open_dataset, shards
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.mazes import MAZES
-from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, _explore, _Job, _roll_out, collect
+from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, _explore, _Job, _roll_out, collect
 
 
 def small(out: Path, **changes: object) -> MazeCollectConfig:
     given = {"maze": "three_curtains", "out": out, "trajectories": 4, "trajectory_rows": 30, "workers": 1}
-    return replace(PRESETS["cpu"], **(given | {"trajectories_per_shard": 2} | changes))
+    return MazeCollectConfig.of("cpu", **(given | {"trajectories_per_shard": 2} | changes))
 
 
 def hashes(folder: Path) -> dict[str, str]:
@@ -112,7 +112,7 @@ def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones()
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"maze": "spiral"}, "unknown maze 'spiral'"),
+        ({"maze": "spiral"}, "unknown --maze 'spiral'"),
         ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
         ({"trajectory_rows": 2**20 + 1}, "--trajectory-rows is 1048577"),
         ({"action_repeat": 0}, "--action-repeat is 0"),

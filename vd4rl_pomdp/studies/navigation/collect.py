@@ -7,16 +7,17 @@ resumes an interrupted collection and ends in the same files.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 
-from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
+from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.options import StageConfig
 from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
@@ -36,16 +37,14 @@ SAMPLES = 6
 _FIRST_SAMPLE, _SAMPLE_STEP = 20, 12
 
 
-@dataclass(frozen=True)
-class MazeCollectConfig:
+@dataclass(frozen=True, kw_only=True)
+class MazeCollectConfig(StageConfig):
     """Settings of `vd4rl-pomdp navigation collect`."""
 
-    maze: str
+    maze: str = ""
     """no_curtain, one_curtain, three_curtains or first_person; compass_first_person; or one of the four after hard_."""
-    out: Path
+    out: Path = Path()
     """Folder of the set."""
-    preset: str = "paper"
-    """paper, cpu or smoke: the defaults of all other settings."""
     trajectories: int = 500
     """Trajectories in all; the last tenth is held out from training."""
     trajectory_rows: int = 1000
@@ -59,19 +58,26 @@ class MazeCollectConfig:
     trajectories_per_shard: int = 5
     """Trajectories in a shard."""
 
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {},
+        "cpu": {"trajectories": 100},
+        "smoke": {"trajectories": 10, "trajectory_rows": 120},
+    }
+    """500k rows as in the paper, 100k, and 1,200 rows."""
 
-_CPU = MazeCollectConfig("", Path(), preset="cpu", trajectories=100)
-PRESETS = {
-    "paper": MazeCollectConfig("", Path()),
-    "cpu": _CPU,
-    "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
-}
-"""Defaults by preset: 500k rows as in the paper, 100k, and 1,200 rows."""
+    def check(self) -> None:
+        """Raise UserError for settings that make no set."""
+        super().check()
+        refuse_unknown("--maze", self.maze, MAZES)
+        refuse_outside(
+            self, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
+            seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
+        )  # fmt: skip
 
 
 def collect(config: MazeCollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
-    check_config(config)
+    config.check()
     refuse_inside(config.out)
     maze, packages = get_maze(config.maze), ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
     attributes = {
@@ -98,15 +104,6 @@ def collect(config: MazeCollectConfig) -> list[Path]:
 def collection(config: MazeCollectConfig) -> dict[str, Any]:
     """What tells a set from others: the settings in its collection.json."""
     return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
-
-
-def check_config(config: MazeCollectConfig) -> None:
-    """Raise UserError for settings that make no set."""
-    get_maze(config.maze)
-    refuse_outside(
-        config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
-        seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from vd4rl_pomdp.envs.mazes import MAZES
 from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.results import Result, find_results, refuse_loss, write_results
-from vd4rl_pomdp.studies.navigation.collect import PRESETS
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, Condition, Measure, measure_of
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
@@ -147,7 +147,10 @@ def _read_run(result: Result) -> NavigationRun:
         config, results, timing = result.record["config"], result.files["results"], result.files["timing"]
         if missing := sorted({"maze", "set", "command", "rows"} - results.keys()):
             raise ValueError(f"results.json has no {missing[0]}")
-        for name, value, known in (("maze", results["maze"], MAZES), ("preset", config["preset"], PRESETS)):
+        for name, value, known in (
+            ("maze", results["maze"], MAZES),
+            ("preset", config["preset"], NavigationConfig.presets),
+        ):
             if value not in known:
                 raise ValueError(f"its {name} is {value!r}")
         if not results["rows"]:
