@@ -34,8 +34,8 @@ QUALITIES: tuple[Quality, ...] = get_args(Quality)
 """V-D4RL's dataset qualities."""
 NoisyQuality = Literal["medium_noisy", "medium_expert_noisy", "expert_noisy"]
 NOISY_QUALITIES: tuple[NoisyQuality, ...] = get_args(NoisyQuality)
-"""This package's own. With action noise, the state does not determine the action, so an inverse model must infer it from
-its effects."""
+"""This package's own. With action noise, the state does not determine the action, so an inverse model must infer it
+from its effects."""
 SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)
 """All qualities that `data collect` can make."""
 UNKNOWN_QUALITY = "unknown"
