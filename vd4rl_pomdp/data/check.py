@@ -1,4 +1,4 @@
-"""Is a set what it claims to be? Its counts, its statistics, and the proof that its actions lead to its rewards."""
+"""Validate a data set: counts, statistics, checksums, and a replay of its actions in the simulator."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ ReplayFn = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
 
 
 def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn | None = None) -> dict[str, Any]:
-    """Validate a set and describe it.
+    """Validate a data set and describe it.
 
     Args:
-        path: folder (or file) of the shards, of a task or of a maze.
-        cache: where decoded sets are kept, as in `open_dataset`.
-        replay: what simulates an episode; default `envs.dmc.replay_rewards`.
+        path: folder of shards, or one file, of a task or a maze.
+        cache: folder of decoded data sets, as in `open_dataset`.
+        replay: function that simulates an episode; default `envs.dmc.replay_rewards`.
 
     Returns:
-        JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `episodes_of_one_row` (on which nothing
-        trains), `action_dim`, `return_mean`, `return_min` and `return_max` over all episodes, incomplete ones included,
-        `replay_max_error` (largest absolute difference between a stored reward, in a maze a true state, and its replay;
-        None where nothing can be replayed), `replay` (how that was found, or why not), `frame_size`, `task`, `quality`,
-        `shards` (names in order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files have their
+        JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `episodes_of_one_row` (not used in
+        training), `action_dim`, `return_mean`, `return_min` and `return_max` over all episodes, incomplete ones
+        included, `replay_max_error` (largest absolute difference between stored and replayed rewards, or states in a
+        maze; None if replay is impossible), `replay` (what was replayed, or why not), `frame_size`, `task`, `quality`,
+        `shards` (names in order), `dtypes` (stored dtypes by key), `store_ok` (True: the cached files match their
         checksums).
 
     Raises:
-        UserError: the set or its decoded form is damaged.
+        UserError: the data set or its cached form is damaged.
     """
     path = Path(path)
     dataset = open_dataset(path, cache)
@@ -85,7 +85,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
 
 
 def _check_actions(dataset: Dataset) -> None:
-    """Raise UserError for actions that cannot be what this format means by them."""
+    """Raise UserError for actions outside [-1, 1], or misaligned ones: first rows have no action and no reward."""
     action, reward = dataset.store.array("action"), dataset.store.array("reward")
     first = dataset.episode_start.numpy()
     if action[first].any() or reward[first].any():
@@ -98,7 +98,7 @@ def _check_actions(dataset: Dataset) -> None:
 
 
 def _why_not_replayed(dataset: Dataset) -> str:
-    """Why the actions of a set with states cannot be replayed to its rewards, "" if they can."""
+    """Why the rewards of a data set with states cannot be replayed; "" if they can."""
     dataset.require_states()
     assert dataset.task is not None
     task = TASKS.named(dataset.task)
@@ -112,7 +112,7 @@ def _why_not_replayed(dataset: Dataset) -> str:
 def _replay_error(
     dataset: Dataset, stored: np.ndarray, replay: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> float:
-    """Largest difference between what is stored with every row and its replay from (first state, actions)."""
+    """Largest absolute difference between the `stored` rows and `replay`(first state, actions) over all episodes."""
     assert dataset.physics is not None
     action, worst = dataset.store.array("action"), 0.0
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
@@ -122,10 +122,10 @@ def _replay_error(
             replayed = replay(dataset.physics[start], action[start + 1 : end])
         except UserError:
             raise
-        except (RuntimeError, ValueError) as error:  # dm_control's, also where the simulation diverges
+        except (RuntimeError, ValueError) as error:  # from dm_control, for example if the simulation diverges
             raise UserError(
                 f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
                 f"({first_line(error)}); put the set in a folder called like its task, or collect it again"
             ) from error
-        worst = np.maximum(worst, np.abs(replayed - stored[start + 1 : end]).max())  # unlike max(), it passes NaN on
+        worst = np.maximum(worst, np.abs(replayed - stored[start + 1 : end]).max())  # unlike max(), propagates NaN
     return float(worst)

@@ -1,7 +1,7 @@
-"""Collect a set in V-D4RL's format, with simulator states and a data card, from the actors that ship with the package.
+"""Collect a data set in V-D4RL's format, with simulator states and a data card, using the shipped actors.
 
-Episode i depends on (seed, i) alone, whatever the number of workers. Shards are written whole: re-running the same
-command resumes an interrupted collection and ends in the same files.
+Episode i depends only on (seed, i), not on the number of workers. Shards are written atomically, so re-running the same
+command resumes an interrupted collection and produces the same files.
 """
 
 from __future__ import annotations
@@ -38,40 +38,40 @@ from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.runs.workers import run_jobs
 
 Collector = Actor | Ladder | None
-"""Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
+"""Policy of a shard: an actor, a ladder of actors, or None for random actions."""
 _RUNTIME_FIELDS = ("out", "workers")
 MAX_NOISE = 2.0
-"""Actions lie in [-1, 1]: noise beyond this leaves nothing of them."""
+"""Largest standard deviation of action noise; beyond this, actions in [-1, 1] would be all noise."""
 
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Settings of `vd4rl-pomdp data collect`."""
+    """Collect a data set."""
 
     task: str
-    """walker_walk, cheetah_run, humanoid_walk, reacher_jump or point_mass_cue, or a task that was added."""
+    """walker_walk, cheetah_run, humanoid_walk, reacher_jump, point_mass_cue, or a task that you registered."""
     quality: Quality | NoisyQuality
-    """Whose episodes: random actions, actors saved on the way to the medium one, the medium actor, half of medium and
-    expert each, or the expert actor; the noisy ones, which V-D4RL has not, add the task's noise to every action."""
+    """Behaviour policy: random actions, checkpoints on the way to the medium actor, the medium actor, half medium and
+    half expert, or the expert actor. The noisy qualities (not in V-D4RL) add the task's noise to every action."""
     out: Path
-    """Folder of the set."""
+    """Folder to write the data set to."""
     episodes: int = 200
-    """Episodes in all, of 501 rows each in the benchmark's tasks (V-D4RL's sets have 200)."""
+    """Number of episodes, of 501 rows each in the benchmark's tasks (V-D4RL's data sets have 200)."""
     seed: int = 0
     """Seed of initial states and actions."""
     workers: int = 0
-    """Processes that simulate and render; 0 uses every core."""
+    """Number of processes that simulate and render; 0: one per core."""
     render: Render = "fast"
-    """fast: a smaller shadow map, 0.03 of 255 away from exact; exact: dm_control's default."""
+    """exact: dm_control's default; fast: a smaller shadow map, with a mean difference of 0.03 of 255."""
     frame_size: int = FRAME_SIZE
     """Height and width of the frames in pixels."""
     episodes_per_shard: int = 50
-    """Episodes in a shard."""
+    """Episodes per shard."""
     actor: Path | None = None
     """An actor file to use instead of the shipped one (for medium or expert)."""
     action_noise: float | None = None
-    """Standard deviation of Gaussian noise that is added to every action, executed and stored, and becomes part of the
-    set's name; default: the quality's own, which is none but for the noisy ones."""
+    """Standard deviation of Gaussian noise added to every action, both executed and stored; it becomes part of the data
+    set's name. Default: none, or the task's noise for the noisy qualities."""
 
 
 @dataclass(frozen=True)
@@ -84,18 +84,18 @@ class _Job:
     actor: Actor | None
     render: Render
     size: int | None
-    """Height and width of the frames; None: physics alone."""
+    """Height and width of the frames; None: no rendering."""
     length: int | None
     noise: float
     """Standard deviation of the noise on actions."""
 
 
 def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
-    """Collect the set, or what is missing of it; returns its shards.
+    """Collect a data set, or its missing shards; returns all shards.
 
     Args:
-        config: what to collect.
-        length: most decisions of an episode; tests and the tour shorten it, all else keeps the task's.
+        config: the settings.
+        length: time limit in decisions, for tests and demos; None: the task's.
     """
     check_config(config)
     refuse_inside(config.out)
@@ -120,27 +120,27 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
     ]
     settings = collection(config) | {"actors": actor_hashes(config)}
     collect_set(config.out, settings, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
-    from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
+    from vd4rl_pomdp.data.card import write_card  # plots; not needed by the worker processes
 
     write_card(config.out)
     return [shard.path for shard in shards]
 
 
 def collection(config: CollectConfig) -> dict[str, Any]:
-    """What tells a set from others: the settings in its collection.json, where its actors' hashes stand beside them."""
+    """Settings that identify a data set; its collection.json holds them together with its actors' hashes."""
     settings = {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
     if config.frame_size == FRAME_SIZE:
-        settings["frame_size"] = None  # as in the files that say nothing of it
+        settings["frame_size"] = None  # as in older files, which do not state it
     return settings
 
 
 def actor_hashes(config: CollectConfig) -> list[str]:
-    """SHA-256 of the files whose actors make the set, sorted."""
+    """Sorted SHA-256 of the actor files that collect the data set."""
     return sorted({collector.sha256 for _, _, collector in _plan(config) if collector is not None})
 
 
 def check_config(config: CollectConfig) -> None:
-    """Raise UserError for settings that make no set."""
+    """Raise UserError for invalid settings."""
     task = TASKS.named(config.task)
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     refuse_outside(config, action_noise=(0, MAX_NOISE), frame_size=FRAME_SIZES)
@@ -164,7 +164,7 @@ def check_config(config: CollectConfig) -> None:
 
 
 def _base(config: CollectConfig) -> str:
-    """Whose episodes they are, noise aside."""
+    """The quality without "_noisy"."""
     return config.quality.removesuffix("_noisy")
 
 
@@ -175,23 +175,23 @@ def _noise(config: CollectConfig) -> float:
 
 
 def _suffix(config: CollectConfig) -> str:
-    """What the noise adds to the names of set and shards."""
+    """Suffix for action noise in the names of data set and shards, such as "_noise0.3"."""
     if config.quality in NOISY_QUALITIES:
         return "_noisy"
     return f"_noise{config.action_noise:g}" if config.action_noise else ""
 
 
 def set_quality(config: CollectConfig) -> str:
-    """The quality that the set's own files and the runs on it tell, noise of one's own included."""
+    """The quality recorded in the data set and in runs on it, including noise: "medium_noise0.3"."""
     return _base(config) + _suffix(config)
 
 
 def play(config: CollectConfig, length: int | None = None) -> Iterator[EpisodeArrays]:
-    """Rows of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards.
+    """Yield the episodes of `collect` without rendering or writing: the same seeds, actions and rewards.
 
     Args:
-        config: what would be collected; its folder is not touched.
-        length: most decisions of an episode; None: the task's own.
+        config: the settings; `out` is not touched.
+        length: time limit in decisions; None: the task's.
     """
     jobs = [
         replace(_job(config, collector, episode, length), size=None)
@@ -205,7 +205,7 @@ def play(config: CollectConfig, length: int | None = None) -> Iterator[EpisodeAr
 
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
-    """Shards to write: file, episode numbers, collector. medium_expert is all medium shards, then all expert ones."""
+    """Yield each shard's file, episode numbers and policy; for medium_expert all medium shards come first."""
     halves = ["medium", "expert"] if _base(config) == "medium_expert" else [_base(config)]
     first = 0
     for number, quality in enumerate(halves):
@@ -222,7 +222,7 @@ def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
 
 
 def _job(config: CollectConfig, collector: Collector, episode: int, length: int | None = None) -> _Job:
-    """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
+    """Job of one episode. With a ladder, episode i of n uses the actor at (i + 0.5) / n of its training run."""
     # The middle of the episode's share of the training run.
     actor = collector.actor_at((episode + 0.5) / config.episodes) if isinstance(collector, Ladder) else collector
     task, size = TASKS.named(config.task), config.frame_size
@@ -230,10 +230,10 @@ def _job(config: CollectConfig, collector: Collector, episode: int, length: int 
 
 
 def _roll_out(job: _Job) -> EpisodeArrays:
-    """Rows of one episode, by key."""
+    """Play one episode; returns its rows by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
-    # A stream of its own: an actor draws the same with and without noise on its actions.
+    # A separate stream, so that the actor's samples are the same with and without noise.
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
     now = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.action_dim, np.float32)
@@ -261,5 +261,5 @@ def _roll_out(job: _Job) -> EpisodeArrays:
 
 @cache
 def _environment(*arguments: Any) -> Any:
-    """The process's environment for these arguments: one GL context serves all its episodes."""
+    """Environment, cached per process, so that all its episodes share one GL context."""
     return make_env(*arguments)

@@ -1,4 +1,4 @@
-"""A data set in memory: rows, episodes, and the arithmetic of their indices; `View` makes pixels of them."""
+"""A data set in memory: rows, episodes, and index arithmetic. `View` turns rows into observations."""
 
 from __future__ import annotations
 
@@ -23,49 +23,50 @@ Index = int | Sequence[int] | np.ndarray | Tensor
 
 
 def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
-    """Open a V-D4RL set: a folder of shards, or one shard.
+    """Open a V-D4RL data set: a folder of shards, or a single shard.
 
-    The first opening decodes the set into the store; later ones map it and take well under a second.
+    The first call decodes it into a cache; later calls memory-map that and take well under a second.
 
     Args:
-        path: folder (or file) of the shards.
-        cache: where decoded sets are kept; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
+        path: folder of shards, or one file.
+        cache: folder of decoded data sets; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
 
     Raises:
-        UserError: the set is missing, empty, damaged, incomplete, a part of a published one, or of two frame sizes.
+        UserError: it is missing, empty, damaged, incomplete, part of a published data set, or has frames of two sizes.
     """
     path = Path(path)
     return Dataset(path, open_store(path, Path(cache) if cache else None))
 
 
 class Dataset:
-    """Rows of a V-D4RL set with their episodes; made by `open_dataset`.
+    """Rows and episodes of a V-D4RL data set; create it with `open_dataset`.
 
-    All tensors live on one device; frames are a read-only map shared with other processes until `to` moves them.
+    All tensors are on one device. Frames are a read-only memory map shared with other processes until `to` moves them.
     """
 
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
         self.store = store
         self._windows: dict[int, tuple[int, Tensor]] = {}
-        """By length: how many there are, and up to each episode's end, (E,) int64; to count is to wait for a GPU."""
+        """Window length -> number of windows, and cumulative number per episode, (E,) int64. A cache: computing it
+        synchronises with the GPU."""
         self.fingerprint = store.fingerprint
-        """Name of the set's content, the same for copies of the set."""
+        """Content hash of the data set."""
         self.task, self.quality = task_and_quality(path, store.meta["attributes"])
-        """Names as in `tasks`, None where neither the shards nor the folders tell."""
+        """Task and quality by name; None if neither the shards nor the folder state them."""
         self.imported = all("imported" in one for one in store.meta["attributes"])
-        """Whether `data import` wrote it: its task may then be a mere name."""
+        """Whether it was written by `data import`; its task may then have no environment."""
         step_type, reward = store.array("step_type"), store.array("reward")
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # nor is it to be written
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # it is only read
             self.frames = torch.from_numpy(store.frames())
-        """(N, 3, S, S) uint8; mapped memory: writing into it kills the process."""
+        """(N, 3, S, S) uint8, a read-only memory map: writing to it crashes the process."""
         self.action = torch.from_numpy(store.array("action"))
         """(N, A) float32: row t holds a_{t-1}."""
         self.reward = torch.from_numpy(reward.astype(np.float32))
         """(N,) float32: row t holds r_{t-1}."""
         self.discount = torch.from_numpy(store.array("discount").astype(np.float32))
-        """(N,) float32: row t holds the discount of the step into it."""
+        """(N,) float32: row t holds the discount of the step that led to it."""
         self.step_type = torch.from_numpy(step_type)
         """(N,) uint8: `types.StepType`."""
         self.physics = store.physics()
@@ -73,32 +74,32 @@ class Dataset:
         starts = np.flatnonzero(step_type == StepType.FIRST)
         ends = np.append(starts[1:], len(step_type))
         self.episode_start, self.episode_end = torch.from_numpy(starts), torch.from_numpy(ends)
-        """(E,) int64: first row of every episode, and the row after its last."""
+        """(E,) int64: first row of every episode, and one past its last row."""
         self.incomplete_episodes = int((step_type[ends - 1] != StepType.LAST).sum())
-        """Episodes that end without a LAST row; they are used like the others."""
+        """Number of episodes without a LAST row; they are used like the others."""
         lengths = self.episode_end - self.episode_start
         self.episode = torch.repeat_interleave(torch.arange(len(starts)), lengths)
         """(N,) int64: episode of every row."""
         self.t = torch.arange(len(step_type)) - self.episode_start[self.episode]
-        """(N,) int64: row within its episode."""
+        """(N,) int64: step of every row within its episode, from 0."""
         self.transition_rows = torch.nonzero(self.t[1:] > 0)[:, 0]
-        """(M,) int64: rows that have a successor in their episode, in order."""
+        """(M,) int64: rows with a successor in their episode, in order."""
         self.returns = torch.from_numpy(episode_returns(reward, starts))
         """(E,) float64: undiscounted return of every episode."""
 
     @property
     def num_rows(self) -> int:
-        """Rows N."""
+        """Number of rows N."""
         return len(self.t)
 
     @property
     def num_episodes(self) -> int:
-        """Episodes, incomplete ones included."""
+        """Number of episodes, incomplete ones included."""
         return len(self.episode_start)
 
     @property
     def num_transitions(self) -> int:
-        """Rows that have a successor in their episode."""
+        """Number of rows with a successor in their episode."""
         return self.num_rows - self.num_episodes
 
     @property
@@ -107,7 +108,7 @@ class Dataset:
         return self.frames.shape[-1]
 
     def require_transitions(self) -> None:
-        """Raise UserError if the set holds none."""
+        """Raise UserError if the data set has no transition."""
         if not self.num_transitions:
             raise UserError(f"{self.path}: holds no transition; every episode in it is a single row: take another set")
 
@@ -117,7 +118,7 @@ class Dataset:
         return self.action.shape[1]
 
     def require_states(self) -> None:
-        """Raise UserError if the set stores no simulator states, or nothing tells whose they are."""
+        """Raise UserError if the data set has no simulator states, or its task is unknown."""
         if self.physics is not None and self.task is None:
             raise UserError(f"{self.path}: has physics but names no task; put it in a folder called like its task")
         if self.physics is None:
@@ -126,19 +127,19 @@ class Dataset:
             )
 
     def rows_of(self, episode: int | range) -> slice:
-        """The rows of an episode, or of consecutive ones."""
+        """Rows of one episode, or of a range of consecutive episodes."""
         first, last = (episode, episode) if isinstance(episode, int) else (episode[0], episode[-1])
         return slice(int(self.episode_start[first]), int(self.episode_end[last]))
 
     def states(self) -> Tensor:
-        """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
+        """Poses and velocities (N, P') float32, on the data set's device; UserError if it has no states."""
         self.require_states()
         assert self.physics is not None
         assert self.task is not None
         return torch.from_numpy(layout_of(TASKS.named(self.task)).visible_state(self.physics)).to(self.t.device)
 
     def state_scale(self) -> StateScale:
-        """Means and standard deviations of `states`, on the CPU; raises UserError if the set has no states."""
+        """Means and standard deviations of `states`, on the CPU; UserError if the data set has no states."""
         states = self.states().cpu()
         assert self.physics is not None
         assert self.task is not None
@@ -149,7 +150,7 @@ class Dataset:
         """Move frames and rows to a device, in place; returns the data set.
 
         Raises:
-            UserError: they do not fit into its memory.
+            UserError: the device's memory is too small.
         """
         try:
             for name, value in vars(self).items():
@@ -164,55 +165,55 @@ class Dataset:
         return self
 
     def keys(self, rows: Tensor) -> Tensor:
-        """`row_key` of every row in `rows`."""
+        """`row_key`s (...,) int64 of rows (...,) int64."""
         return row_key(self.episode[rows], self.t[rows])
 
     def rows(self, key: Tensor) -> Tensor:
-        """The rows that (...,) int64 `row_key`s name: (...,) int64."""
+        """Rows (...,) int64 of `row_key`s (...,) int64; the inverse of `keys`."""
         episode, t = unpack_row_key(key)
         return self.episode_start[episode] + t
 
     def action_after(self, rows: Tensor) -> Tensor:
-        """a_t (..., A) float32 of (...,) int64 rows t that have a successor."""
+        """a_t (..., A) float32 of (...,) int64 rows t, which must have a successor."""
         return self.action[rows + 1]
 
     def action_or_zero(self, rows: Tensor) -> Tensor:
-        """a_t (..., A) float32 of any (...,) int64 rows t; zero at an episode's last, which has none."""
+        """a_t (..., A) float32 of any (...,) int64 rows t; zero at an episode's last row, which has no action."""
         last = (self.episode_end - 1)[self.episode[rows]]
         return self.action[torch.minimum(rows + 1, last)] * (rows < last)[..., None]
 
     def actions_before(self, rows: Tensor) -> Tensor:
-        """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero in the first: a history begins without one."""
+        """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero at the first, where the history starts."""
         actions = self.action[rows]
-        # The row stores an action, but it was taken before the history that is shown.
+        # The stored action was taken before the window.
         actions[..., 0, :] = 0
         return actions
 
     def stack_rows(self, rows: Tensor, frame_stack: int) -> Tensor:
-        """Rows (..., frame_stack) int64 of the frames in the stacks of (...,) int64 rows, oldest frame first.
+        """Rows (..., frame_stack) int64 of the frames in each row's stack, oldest first.
 
-        A stack never reaches before its episode: there the first frame is repeated. IndexError for a negative row.
+        At the start of an episode its first frame is repeated. IndexError for a negative row.
         """
-        if buffers.in_host_memory(rows) and (rows < 0).any():  # elsewhere to look would mean to wait
+        if buffers.in_host_memory(rows) and (rows < 0).any():  # on a GPU the check would synchronise
             raise IndexError(f"row {int(rows.min())} is out of range for a set of {self.num_rows} rows")
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
         return torch.maximum(rows[..., None] - back, first[..., None])
 
     def rows_of_transitions(self, index: Index) -> Tensor:
-        """Rows (B,) int64 of (B,) numbers in 0..num_transitions-1, which count `transition_rows`; else IndexError."""
+        """Rows (B,) int64 of transition numbers (B,) in 0..num_transitions-1; IndexError if out of range."""
         return self.transition_rows[self._index(index, self.num_transitions)]
 
     def n_step_returns(self, rows: Tensor, n_step: int, gamma: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Reward and discount (B,) float32 and successor (B,) int64 of each of (B,) int64 rows.
+        """n-step reward and discount (B,) float32 and successor row (B,) int64 of rows (B,) int64.
 
         With m = min(n_step, steps left) and d_i the product of the first i stored discounts, the reward is the sum of
-        gamma^i d_i r_{t+i} for i < m, and the discount is gamma^(m-1) d_m. The learner multiplies its own gamma once
-        more (acme's convention), also where m is cut short: for n_step = 1 both are as stored. An episode's last row
-        has no successor: there they are 0, 1 and the row itself.
+        gamma^i d_i r_{t+i} over i < m, and the discount is gamma^(m-1) d_m. The learner multiplies by gamma once more
+        (acme's convention), for any m; so for n_step = 1 both are as stored. For an episode's last row, which has no
+        successor, the result is 0, 1 and the row itself.
         """
         refuse_number("n_step", n_step, 1)
-        # Row t + 1 holds what step t paid: rows t + 1 .. t + m are summed, none behind the episode's last.
+        # Row t + 1 stores the reward of step t: sum rows t + 1 .. t + m, up to the episode's last row.
         last = (self.episode_end - 1)[self.episode[rows]]
         step = torch.arange(n_step, device=rows.device)
         inside = rows[:, None] + step < last[:, None]
@@ -223,15 +224,15 @@ class Dataset:
         return reward, discount[:, -1] * gamma ** (inside.sum(1) - 1).clamp(min=0), self.successors(rows, n_step)
 
     def successors(self, rows: Tensor, n_step: int) -> Tensor:
-        """Rows (B,) int64 that lie `n_step` behind (B,) int64 rows, or their episode's last."""
+        """Rows (B,) int64 that are `n_step` after the given ones, or their episode's last row."""
         return torch.minimum(rows + n_step, (self.episode_end - 1)[self.episode[rows]])
 
     def num_windows(self, length: int) -> int:
-        """Number of windows of `length` consecutive rows of one episode; raises UserError as `check_windows` does."""
+        """Number of windows of `length` consecutive rows within an episode; errors as `check_windows`."""
         return self._counted(length)[0]
 
     def _counted(self, length: int) -> tuple[int, Tensor]:
-        """What `_windows` holds of a length."""
+        """Entry of `_windows` for a length, computed if needed."""
         if length not in self._windows:
             self.check_windows(length)
             ends = self.windows_per_episode(length).cumsum(0)
@@ -239,11 +240,11 @@ class Dataset:
         return self._windows[length]
 
     def window_rows(self, index: Index, length: int) -> Tensor:
-        """Rows (B, length) int64 of windows of consecutive rows.
+        """Rows (B, length) int64 of windows.
 
         Args:
-            index: (B,) numbers in 0..num_windows(length)-1; they count all starts within episodes, in order.
-            length: rows of each window.
+            index: (B,) window numbers in 0..num_windows(length)-1, counting all possible starts in order.
+            length: rows per window.
 
         Raises:
             UserError: an episode is shorter than the window.
@@ -251,15 +252,15 @@ class Dataset:
         """
         count, ends = self._counted(length)
         number, per_episode = self._index(index, count), self.windows_per_episode(length)
-        # Starts are numbered through the episodes; where their counts pass a number, its episode is found.
+        # Window numbers run through all episodes; the cumulative counts `ends` locate a number's episode.
         episode = torch.searchsorted(ends, number, right=True)
         start = self.episode_start[episode] + number - (ends - per_episode)[episode]
         return start[:, None] + torch.arange(length, device=start.device)
 
     def check_windows(self, length: int) -> None:
-        """Raise UserError unless every episode has a window of `length` rows, but for those without a transition.
+        """Raise UserError if an episode with at least one transition is shorter than `length` rows.
 
-        An episode of a single row has nothing to train on, whatever the window: `window_rows` leaves it out.
+        Episodes of a single row have nothing to train on; `window_rows` skips them.
         """
         refuse_number("length", length, 1)
         self.require_transitions()
@@ -275,17 +276,17 @@ class Dataset:
 
     @property
     def longest_episode(self) -> int:
-        """Rows of the longest episode."""
+        """Number of rows of the longest episode."""
         return int(self.t.max()) + 1
 
     def windows_per_episode(self, length: int) -> Tensor:
-        """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""
+        """Number of windows of `length` rows in each episode, (E,) int64; for 2, the number of transitions."""
         return (self.episode_end - self.episode_start - (length - 1)).clamp(min=0)
 
     def _index(self, index: Index, size: int) -> Tensor:
-        """`index` as (B,) int64 on the set's device; its values are checked on a CPU, and nothing waits for a GPU."""
+        """Convert `index` to (B,) int64 on the data set's device; its range is checked only if it is on the CPU."""
         if isinstance(index, np.ndarray):
-            index = index.copy()  # torch takes neither negative strides nor, without a warning, read-only memory
+            index = index.copy()  # torch rejects negative strides and warns about read-only memory
         number = torch.atleast_1d(torch.as_tensor(index))
         if not number.numel():
             return torch.zeros(0, dtype=torch.int64, device=self.t.device)
@@ -296,5 +297,5 @@ class Dataset:
             low, high = int(number.min()), int(number.max())
             if low < 0 or high >= size:
                 raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
-        # without waiting; but a CPU would read before the copy has come
+        # non_blocking only towards a GPU: the CPU could read before a copy to it has arrived
         return number.to(self.t.device, non_blocking=self.t.device.type != "cpu")

@@ -1,4 +1,4 @@
-"""A set is a folder of shards: which are its, in what order, whether all of them are there, and what it is called."""
+"""Data set folders: find and order their shards, check that none is missing, and determine task and quality."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vd4rl_pomdp.runs.files import read_json
 
 SUFFIXES = (".hdf5", ".h5")
 PLAN, PROVENANCE = "collection.json", "provenance.json"
-"""What a collection writes before its first shard, and after its last."""
+"""Files that a collection writes before its first shard, and after its last one."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class RemoteFile:
     """One published 84-pixel shard."""
 
     path: str
-    """vd4rl/main/{task}/{quality}/84px/{file}: its place on the mirror."""
+    """Path on the mirror: vd4rl/main/{task}/{quality}/84px/{file}."""
     size: int
     """Bytes."""
     sha256: str
 
     def target(self, destination: Path) -> Path:
-        """Where the file goes: destination/{task}/{quality}/84px/{file}."""
+        """Local path: destination/{task}/{quality}/84px/{file}."""
         return destination.joinpath(*self.path.split("/")[2:])
 
 
@@ -49,7 +49,7 @@ def manifest() -> tuple[RemoteFile, ...]:
 
 
 def published_scores() -> list[dict[str, str]]:
-    """Scores (return / 10) of methods trained on each published set, fully observed, one row a set.
+    """Published scores (return / 10) of methods on fully observed data sets, one row per data set.
 
     Columns: `env`, `dataset`, then methods. Sources: V-D4RL (Lu et al. 2022, arXiv 2206.04779), and for `rebrac`
     Tarasov et al. 2023 (arXiv 2305.09836).
@@ -62,30 +62,30 @@ def _packaged(name: str) -> list[str]:
 
 
 def read_plan(folder: Path) -> dict[str, Any]:
-    """How a set was collected, as its collection.json has it; empty for sets of other makers."""
+    """Contents of a data set's collection.json; empty if it was not collected by this package."""
     return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
 
 
 def is_shard_name(name: str) -> bool:
-    """Whether a file of this name is a shard: hidden ones are none."""
+    """Whether a file name is that of a shard; hidden files are not."""
     return not name.startswith(".") and name.lower().endswith(SUFFIXES)
 
 
 def shard_files(folder: Path) -> list[Path]:
-    """Files of a folder that are called shards, in no order; none without a folder. `shard_paths` checks them."""
+    """Files in a folder with a shard's name, unordered and unchecked (see `shard_paths`); [] if there is no folder."""
     with disk_errors(folder):
         return [path for path in folder.iterdir() if is_shard_name(path.name)] if folder.is_dir() else []
 
 
 def shard_paths(folder: Path) -> list[Path]:
-    """Shards of a set in the order of their rows; `folder` may also name a single shard.
+    """Shards of a data set in the order of their rows; `folder` may also be a single shard.
 
-    Sorted by name without its leading number, then by that number, digits compared as numbers: `10_mixed` follows
-    `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
+    They are sorted by name without the leading number, then by that number, with digits compared as numbers:
+    `10_mixed` follows `9_mixed`, and the two halves of a medium_expert folder are not interleaved.
 
     Raises:
-        UserError: there is no such folder, no shard in it, a number is left out or there twice among shards whose
-            names agree otherwise, its collection was cut, or it is a part of a published set.
+        UserError: there is no such folder or no shard in it, a number is missing or duplicated among shards of the
+            same name, its collection is unfinished, or it is only part of a published data set.
     """
     if folder.is_file():
         return [folder]
@@ -105,7 +105,7 @@ def shard_paths(folder: Path) -> list[Path]:
 
 
 def _shard_number(path: Path) -> tuple[str, int | None]:
-    """Name of a shard without its leading number, and that number (None if the name has none)."""
+    """Split a shard's name into the rest and its leading number: 10_mixed -> ("_mixed", 10); None if there is none."""
     number, rest = re.fullmatch(r"(\d*)(.*)", path.stem, re.DOTALL).groups()  # type: ignore[union-attr]
     return rest, int(number) if number else None
 
@@ -117,7 +117,7 @@ def _shard_order(path: Path) -> tuple[list[tuple[int, str]], int]:
 
 
 def _refuse_misnumbered(folder: Path, shards: Sequence[Path]) -> None:
-    """Raise UserError unless shards whose names agree otherwise are numbered 0, 1, 2, ..., each of them once."""
+    """Raise UserError unless shards of the same name are numbered 0, 1, 2, ... without gaps and duplicates."""
     alike: dict[str, dict[int | None, Path]] = defaultdict(dict)
     for shard in sorted(shards):
         rest, number = _shard_number(shard)
@@ -135,9 +135,10 @@ def _refuse_misnumbered(folder: Path, shards: Sequence[Path]) -> None:
 
 
 def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
-    """Raise UserError for a folder of a published set that lacks some of its shards.
+    """Raise UserError if some shards of a published data set are missing.
 
-    A folder is one if it is called like the set, and its shards are, and say nothing of who made them.
+    A folder counts as published if its path and its shards are named like that data set's, and the shards have no
+    attributes by this package.
     """
     task, quality = task_and_quality(path, [])
     wanted = [file.path.rpartition("/")[2] for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
@@ -154,9 +155,9 @@ def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
 
 
 def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
-    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named.
+    """Task and quality of a data set, from its shards' attributes, else from the names of its folders.
 
-    A quality of one's own is the name of a folder within its task's.
+    Any folder name directly within a task's folder is accepted as a quality.
     """
     task, quality = _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
     return task, quality or (path.name if path.parent.name in TASKS else None)
@@ -166,22 +167,22 @@ def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices:
     stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
     if len(stored) > 1:
         raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
-    folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's name comes before its target's
+    folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's own name has priority
     named = (part for part in reversed(folders) if part in choices)
     return stored.pop() if stored else next(named, None)
 
 
 def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Concatenate the rows of all shards into those of the set.
+    """Concatenate the rows of all shards.
 
     Args:
-        path: the set, or a single shard.
-        shards: its files, as `shard_paths` gives them.
-        parts: their rows, as `read_rows` gives them.
+        path: the data set, or a single shard.
+        shards: its files, from `shard_paths`.
+        parts: their rows, from `read_rows`.
 
     Raises:
-        UserError: the shards differ in width or keys, an episode's beginning is missing, or a collected set has not
-            as many episodes as its collection.json says.
+        UserError: the shards differ in dimensions or keys, an episode's start is missing, or the number of episodes
+            differs from that in collection.json.
     """
     first, expected = shards[0], parts[0]
     for shard, part in zip(shards, parts, strict=True):
@@ -201,9 +202,9 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
 
 
 def check_count(path: Path, episodes: int) -> None:
-    """Refuse a collected set that lacks episodes; a set of other makers says nothing of their number."""
+    """Raise UserError if a collected data set has another number of episodes than its collection.json states."""
     plan = read_plan(path)
-    planned = plan.get("episodes", plan.get("trajectories", episodes))  # as its command calls them
+    planned = plan.get("episodes", plan.get("trajectories", episodes))  # the commands use either name
     if episodes != planned:
         raise UserError(
             f"{path}: holds {episodes} episodes, its {PLAN} says {planned}: is a shard missing or of another set? "
@@ -212,7 +213,7 @@ def check_count(path: Path, episodes: int) -> None:
 
 
 def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarray) -> None:
-    """Every row that does not begin an episode must continue the one of the row before it."""
+    """Raise UserError unless every row starts an episode or continues the previous row's."""
 
     def fail(row: int, what: str) -> None:
         shard = int(np.searchsorted(starts, row, side="right")) - 1
@@ -226,7 +227,7 @@ def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarr
         fail(int(astray[0]), f"follows an episode's last row without beginning a new one{missing}")
     for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
         (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
-        # unless both are numbered, their order is all we know
+        # without numbers, shards are assumed to be consecutive
         adjacent = before is None or number is None or (rest == previous_rest and number == before + 1)
         if step_type[row] != StepType.FIRST and not adjacent:
             fail(int(row), f"continues an episode, but not that of {previous.name}{missing}")
@@ -236,7 +237,7 @@ def episode_returns(reward: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Undiscounted returns of all episodes.
 
     Args:
-        reward: (N,) float64 of all rows; that of an episode's first row, which no action led to, does not count.
+        reward: (N,) float64; rewards at first rows, which follow no action, are ignored.
         starts: (E,) int64, first row of every episode.
 
     Returns:

@@ -1,11 +1,11 @@
-"""V-D4RL shards: gzip HDF5 files of single frames, read as they are published and written so that others can read them.
+"""Read and write V-D4RL shards, gzip-compressed HDF5 files of single frames:
 
     observation (N, 3, S, S) uint8      action (N, A) float32    reward (N,) float64    discount (N,) float64
     step_type   (N,) 0 first, 1 mid, 2 last (int64 in some published files, float64 in others)
     physics     (N, P) float64, simulator state of every row: only in sets collected by this package
 
-S is 84 in the benchmark and 100 in mazes; all shards of a set agree in it. A set is a folder of shards. Its rows are
-those of all shards in order; an episode may continue in the next shard.
+S is 84 in the benchmark and 100 in mazes, and the same in all shards of a data set. A data set is a folder of shards,
+whose rows are concatenated in order; an episode may continue in the next shard.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ _WRITTEN = {FRAMES_KEY: "uint8", "action": "float32", "step_type": "int64"}
 _ATTRIBUTE = "vd4rl_pomdp"
 _BLOCK_ROWS = 1024
 _LARGEST = np.finfo(np.float32).max
-"""What is larger, or not a number, would be infinite or none where it is used."""
+"""Larger values would become infinite in float32."""
 _REPAIR = "download or collect it again"
 
 
 def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
-    """Write one shard; a reader sees it whole or not at all. Equal input gives equal bytes.
+    """Write one shard atomically. Equal input gives equal bytes.
 
     Args:
-        path: the shard's final name; until it is whole it is a hidden file beside it. One writer at a time.
-        rows: the arrays of the module's table, by key, of equal length; they are stored in the table's dtypes.
-        attributes: JSON values to keep with the shard: `task`, `set` (the quality), seed, versions.
+        path: the shard's file; it is written to a hidden file next to it and renamed. One writer at a time.
+        rows: arrays by key, of equal length, as in the module's table; converted to its dtypes.
+        attributes: JSON values to store with the shard: `task`, `set` (the quality), seed, versions.
 
     Raises:
-        UserError: frames are not of uint8, the disk is full or the folder cannot be written; nothing is left behind.
+        UserError: frames are not uint8, the disk is full or the folder not writable; no partial file remains.
     """
     if (dtype := np.asarray(rows.get(FRAMES_KEY, np.uint8(0))).dtype) != np.uint8:
         raise UserError(f"{path}: {FRAMES_KEY} is of {dtype}; frames are of uint8, from 0 to 255")
@@ -63,7 +63,7 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
-    """What `write_shard` kept with a shard; empty for a published one."""
+    """Attributes that `write_shard` stored with a shard; empty for V-D4RL's own."""
     with _open(path) as file:
         stored = file.attrs.get(_ATTRIBUTE, "{}")
         attributes = parse_json(stored) if isinstance(stored, str) else None
@@ -79,7 +79,7 @@ def read_dtypes(path: Path) -> dict[str, str]:
 
 
 def read_frame_size(shards: Sequence[Path]) -> int:
-    """Height and width S of a set's frames; raises UserError for frames of another shape or dtype, or of two sizes."""
+    """Height and width S of a data set's frames; UserError for another shape or dtype, or for two sizes."""
     sizes = [_frame_size(path) for path in shards]
     for path, size in zip(shards, sizes, strict=True):
         if size != sizes[0]:
@@ -106,17 +106,17 @@ def _frame_size(path: Path) -> int:
 
 
 def read_rows(path: Path) -> dict[str, np.ndarray]:
-    """Read and validate all of a shard but its pixels.
+    """Read and validate everything in a shard except its frames.
 
     Args:
         path: the shard.
 
     Returns:
-        action (N, A) float32, reward and discount (N,) float64, step_type (N,) uint8, and where the shard has it
-        physics (N, P) float64.
+        action (N, A) float32, reward and discount (N,) float64, step_type (N,) uint8, and physics (N, P) float64 if
+        the shard has it.
 
     Raises:
-        UserError: the file is truncated or no HDF5, lacks a key, or holds a wrong shape, dtype or value.
+        UserError: the file is truncated, not HDF5, lacks a key, or has a wrong shape, dtype or value.
     """
     read_frame_size([path])
     with _open(path) as file:
@@ -129,10 +129,10 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
 
 
 def check_rows(place: Path | str, rows: Mapping[str, np.ndarray], count: int) -> None:
-    """Raise UserError, which names the place, unless `count` rows have the shapes, dtypes and values of a shard's."""
+    """Raise UserError, naming `place`, unless `rows` hold `count` rows with valid shapes, dtypes and values."""
     for key, value in rows.items():
         _check_column(place, key, value, count)
-    # an episode's first row, which no step led to, may store any discount
+    # first rows, which follow no step, may store any discount
     outside = ((rows["discount"] < 0) | (rows["discount"] > 1)) & (rows["step_type"] != StepType.FIRST)
     if outside.any():
         row = int(outside.argmax())
@@ -145,20 +145,20 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
     with _open(path) as file:
         frames = file[FRAMES_KEY]
         chunk = frames.chunks[0] if frames.chunks else 1
-        rows = max(1, _BLOCK_ROWS // chunk) * chunk  # whole chunks: none is inflated twice
+        rows = max(1, _BLOCK_ROWS // chunk) * chunk  # whole chunks, so that each is decompressed once
         for start in range(0, len(frames), rows):
             yield frames[start : start + rows]
 
 
 def read_some_frames(path: Path, rows: np.ndarray) -> np.ndarray:
-    """Frames of a shard's rows, (R, 3, S, S) uint8, given increasing row numbers (R,)."""
+    """Read the frames (R, 3, S, S) uint8 of increasing row numbers (R,)."""
     with _open(path) as file:
         return file[FRAMES_KEY][rows]
 
 
 @contextmanager
 def _open(path: Path) -> Iterator[h5py.File]:
-    """An open shard; whatever HDF5 cannot read becomes a sentence."""
+    """Open a shard; HDF5's errors become one-line UserErrors."""
     try:
         with h5py.File(regular(path), "r") as file:
             yield file
@@ -170,7 +170,7 @@ def _open(path: Path) -> Iterator[h5py.File]:
 
 
 def _locked(path: Path, error: Exception) -> UserError | None:
-    """A sentence for a shard that HDF5 does not open for a lock, or for the mark of a program that writes it."""
+    """Error for a shard that is locked, or marked by HDF5 as open for writing; None for other errors."""
     if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
         return UnavailableError(
             f"{path}: another program writes it, or its disk has no locks ({os.strerror(error.errno).lower()}); close "
@@ -185,7 +185,7 @@ def _locked(path: Path, error: Exception) -> UserError | None:
 
 
 def _keys(path: Path, file: h5py.File) -> list[str]:
-    """The format's keys in a file, physics if anything is called so; UserError for one that is no array in the file."""
+    """Keys of the format that are in a file; UserError if one is missing, no array, or stored in another file."""
     wanted = [FRAMES_KEY, *_ROW_KEYS]
     keys = [key for key in wanted if key != _OPTIONAL or file.get(key, getlink=True) is not None]
     for key in keys:
@@ -201,7 +201,7 @@ def _keys(path: Path, file: h5py.File) -> list[str]:
 
 
 def _check_column(path: Path | str, key: str, value: np.ndarray, count: int) -> None:
-    """Refuse a wrong shape, dtype or value of one key."""
+    """Raise UserError for a wrong shape, dtype or value of one key."""
     if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
         expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"
         raise UserError(f"{path}: {key!r} has shape {value.shape}, expected {expected}; {_REPAIR}")
@@ -211,7 +211,7 @@ def _check_column(path: Path | str, key: str, value: np.ndarray, count: int) -> 
         return
     if value.dtype.kind != "f":
         raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
-    # Not `> _LARGEST`, which NaN passes.
+    # Not `> _LARGEST`, which is False for NaN.
     bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
     if len(bad):
         raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")

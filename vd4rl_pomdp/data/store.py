@@ -1,10 +1,10 @@
-"""The store: a set decoded once into flat memory-mapped arrays that every process of the machine shares.
+"""The store: a cache of data sets decoded into flat memory-mapped arrays, shared by all processes of the machine.
 
     <cache>/<key>/  frames.u8  (N, 3, S, S) uint8, each frame once      action.npy ... physics.npy
                     meta.json  rows, shards, attributes, size and checksum of every file
 
-The key names the shards, their sizes and their times, so a changed set is decoded anew. Decoding happens in a hidden
-folder that is renamed when it is whole, under a lock that dies with its process. The cache may be deleted at any time.
+The key hashes the shards' paths, sizes and modification times, so a changed data set is decoded again. Decoding writes
+to a hidden folder and renames it at the end, under a file lock. The cache may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _META = "meta.json"
 
 @dataclass(frozen=True)
 class Store:
-    """A decoded set on disk."""
+    """A decoded data set on disk."""
 
     folder: Path
     meta: dict[str, Any]
@@ -49,10 +49,10 @@ class Store:
 
     @property
     def fingerprint(self) -> str:
-        """Name of the set's content as training reads it: equal for equal rows, wherever and whenever they were made.
+        """Hash of the content as training reads it; equal rows have equal fingerprints on every machine.
 
-        Rewards count as float32, which is what `Dataset` trains on. The last bits of a float64 are the processor's:
-        dm_control's rewards call numpy's exp, which has code of its own where there is AVX-512.
+        Rewards are hashed as float32, which `Dataset` trains on. Their last float64 bits depend on the processor:
+        dm_control's rewards call numpy's exp, which has a separate implementation for AVX-512.
         """
         checksums = {name: file["blake2b"] for name, file in self.meta["files"].items()}
         reward, file = self.array("reward"), io.BytesIO()
@@ -66,7 +66,7 @@ class Store:
         return math.isqrt(self.meta["files"][_FRAMES]["bytes"] // (3 * self.meta["rows"]))
 
     def frames(self) -> np.ndarray:
-        """(N, 3, S, S) uint8, mapped read-only from the file."""
+        """Frames (N, 3, S, S) uint8, memory-mapped read-only."""
         shape = (self.meta["rows"], 3, self.frame_size, self.frame_size)
         return self._load(_FRAMES, lambda path: np.memmap(path, np.uint8, "r", shape=shape))
 
@@ -81,28 +81,28 @@ class Store:
             raise system_error(self.folder / name, error) or self.damaged(name) from error
 
     def damaged(self, name: str) -> UserError:
-        """A sentence for a file that has changed since it was decoded."""
+        """Error for a cached file that is damaged or was changed."""
         return UserError(f"{self.folder / name}: is damaged; delete {self.folder} and the set is decoded anew")
 
     def physics(self) -> np.ndarray | None:
-        """(N, P) float64 simulator states, mapped read-only; None if the set has none."""
+        """Simulator states (N, P) float64, memory-mapped read-only; None if the data set has none."""
         if "physics.npy" not in self.meta["files"]:
             return None
         return self._load("physics.npy", partial(np.load, mmap_mode="r"))
 
 
 def default_cache() -> Path:
-    """Where decoded sets are kept: $VD4RL_POMDP_CACHE, else the user's cache folder."""
+    """Folder of decoded data sets: $VD4RL_POMDP_CACHE, else the user's cache folder."""
     if chosen := os.environ.get("VD4RL_POMDP_CACHE"):
         return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vd4rl-pomdp"
 
 
 def open_store(path: Path, cache: Path | None = None) -> Store:
-    """Open the decoded form of the set at `path`, decoding it first if that was never done.
+    """Open the decoded form of the data set at `path`, decoding it first if needed.
 
     Raises:
-        UserError: the set is missing, damaged, incomplete or of two frame sizes, or the cache cannot be written.
+        UserError: the data set is missing, damaged, incomplete or has two frame sizes, or the cache is not writable.
     """
     with disk_errors(path):
         shards = shard_paths(path)
@@ -114,12 +114,12 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
         with _locked(folder):
             meta = _read_meta(folder) or _decode(path, shards, folder)
     store = Store(folder, meta)
-    check_count(path, int((store.array("step_type") == StepType.FIRST).sum()))  # its shards may have been another's
+    check_count(path, int((store.array("step_type") == StepType.FIRST).sum()))  # collection.json is not in the key
     return store
 
 
 def verify_store(store: Store) -> None:
-    """Recompute every checksum; raises UserError naming the file that has changed since it was decoded."""
+    """Recompute every checksum; UserError naming the first file that differs."""
     for name, file in store.meta["files"].items():
         with disk_errors(store.folder / name):
             checksum = _checksum(store.folder / name)
@@ -128,7 +128,7 @@ def verify_store(store: Store) -> None:
 
 
 def _read_meta(folder: Path) -> dict[str, Any] | None:
-    """The folder's meta.json; None unless it is whole and every file is there in its full size."""
+    """A folder's meta.json; None unless it is valid and every file exists with its full size."""
     try:
         meta = parse_json(read_bytes(folder / _META))
         files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
@@ -141,10 +141,10 @@ def _read_meta(folder: Path) -> dict[str, Any] | None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Let one process at a time decode into a folder; the others wait and find it done."""
+    """Lock a folder for decoding, so that one process decodes and the others wait for it."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        # Never removed: two processes could then lock two files of one name.
+        # The lock file is never removed: else two processes could lock different files of the same name.
         file = folder.with_suffix(".lock").open("w", encoding="utf-8")
     except OSError as error:
         raise disk_error(folder.parent, error) from error
@@ -160,7 +160,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
-    """Decode into a hidden folder and rename it; what a killed process left there is removed first."""
+    """Decode into a hidden folder, then rename it; leftovers of a killed process are removed first."""
     frame_size = read_frame_size(shards)
     rows = join_shards(path, shards, [read_rows(shard) for shard in shards])
     scratch = folder.with_name(f".{folder.name}.tmp")
@@ -180,7 +180,7 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
         meta = _describe(shards, scratch, len(rows["reward"]))
         (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
-        # The last step: whatever kills the process before it leaves no folder of that name.
+        # The last step, so that a killed process leaves no incomplete folder.
         scratch.rename(folder)
     except OSError as error:
         raise disk_error(folder.parent, error) from error
@@ -190,7 +190,7 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
 
 
 def _write_frames(shards: Sequence[Path], path: Path, rows: int) -> None:
-    # written, not mapped: a full disk is then an error instead of a signal
+    # written, not memory-mapped: a full disk then raises an error instead of SIGBUS
     progress = ProgressLine("decode", rows, "frames") if sys.stderr.isatty() else None
     with path.open("wb") as file, progress or nullcontext():
         for shard in shards:

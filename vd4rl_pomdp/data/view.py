@@ -1,4 +1,4 @@
-"""A data set as an agent sees it: stacked frames, shifted at random, then corrupted; and batches of it."""
+"""Views and samplers: a data set as an agent sees it (stacked, randomly shifted, then corrupted), in batches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vd4rl_pomdp.data.dataset import Dataset, Index
 
 
 class View:
-    """A set, the shift and the corruption under which it is seen, and the streams that both are drawn from."""
+    """A data set with the random shift and corruption applied to its observations, and their random streams."""
 
     def __init__(
         self,
@@ -33,16 +33,16 @@ class View:
         frame_stack: int = FRAME_STACK,
         shared: Sharing = "window",
     ) -> None:
-        """See the class.
+        """Initialise.
 
         Args:
-            dataset: the set; moving it to a device moves what the view shows.
-            corruption: what makes the observations partial, or its name; None for nothing.
+            dataset: the data set; batches are on its device.
+            corruption: config or name of the corruption; None: none.
             shift: largest random shift in pixels.
             seed: the run's seed.
-            name: tells the views of a run apart: each draws from streams of its own.
-            frame_stack: frames in an observation.
-            shared: what one shift is shared by.
+            name: name of the view's random streams, which distinguishes the views of a run.
+            frame_stack: frames per observation.
+            shared: whether all observations of a window get the same shift, or only the frames of one observation.
         """
         refuse_unknown("sharing", shared, get_args(Sharing))
         refuse_number("frame_stack", frame_stack, 1)
@@ -52,12 +52,11 @@ class View:
         self._pad, self._frame_stack, self._shared = shift, frame_stack, shared
 
     def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
-        """Observations of rows. On a CPU, under a shift, frames that the corruption zeroes are never read.
+        """Observations of rows. On a CPU, with a shift, frames that the corruption zeroes are never read.
 
         Args:
-            rows: (N, ...) int64; everything under one leading index is shifted alike, unless shifts are shared by the
-                frames of one observation alone.
-            shift_key: (N,) int64, what the shifts are drawn from; None: the next keys of the view's stream.
+            rows: (N, ...) int64; all observations under one leading index get the same shift if `shared` is "window".
+            shift_key: (N,) int64 keys of the shifts; None: the next keys of the view's stream.
 
         Returns:
             (N, ..., C, H, W) uint8, C = 3 * frame_stack.
@@ -65,7 +64,7 @@ class View:
         if shift_key is None:
             shifts = len(rows) if self._shared == "window" else rows.numel()
             shift_key = self.shifts.take((shifts,), rows.device)
-        # Keys are taken whichever way is gone: the streams stand alike on every device.
+        # Take the keys before branching, so that the streams advance equally on every device.
         keys = self.corruption.keys(self.dataset.keys(rows))
         frames = self.dataset.frames
         if augmentation.by_lines(frames, self._pad):
@@ -81,7 +80,7 @@ class View:
         return self.corruption.corruption.apply_(shifted, keys)
 
     def stacks(self, rows: Tensor) -> Tensor:
-        """(..., C, H, W) uint8 frame stacks of (...,) int64 rows as they are stored, neither shifted nor corrupted."""
+        """Stored frame stacks (..., C, H, W) uint8 of (...,) int64 rows, neither shifted nor corrupted."""
         frames = self.dataset.frames
         index = self.dataset.stack_rows(rows, self._frame_stack).flatten()
         out = BUFFERS.take((len(index), *frames.shape[1:])) if buffers.in_host_memory(frames) else None
@@ -89,14 +88,14 @@ class View:
         return stored.view(*rows.shape, frames.shape[1] * self._frame_stack, *frames.shape[2:])
 
     def windows(self, index: Index, length: int) -> Windows:
-        """The windows that `Dataset.window_rows` numbers, as the agent sees them; none of them is padded.
+        """Windows with numbers `index` (see `Dataset.window_rows`), shifted and corrupted; none is padded.
 
-        A stack may reach before its window, never before its episode. `action` of the last row is the next row's,
-        outside the window, if there is one.
+        A frame stack may extend before its window, but not before its episode. `action` at the window's last row comes
+        from the row after the window, if the episode has one.
         """
         data, rows = self.dataset, self.dataset.window_rows(index, length)
         has_action = rows + 1 < data.episode_end[data.episode[rows]]
-        # Without an action, row 0 stands in (it has one) and is multiplied away: no branch, no wait for a GPU.
+        # Rows without an action use row 0's, multiplied by 0: no branch, so no synchronisation with a GPU.
         following = data.action_after(torch.where(has_action, rows, 0))
         return Windows(
             obs=self.observe(rows),
@@ -108,9 +107,9 @@ class View:
         )
 
     def histories(self, first: Tensor, length: int) -> Windows:
-        """From (B,) int64 rows `first` on to the ends of their episodes, at most `length` rows, the rest is padding.
+        """Rows from `first` (B,) int64 to the episode's end, at most `length`, padded to `length`.
 
-        They are shown by their first observation alone: `obs` repeats it, in the memory of one.
+        Only the first observation is rendered: `obs` repeats it for all rows, as an expanded view without copies.
         """
         data = self.dataset
         end = data.episode_end[data.episode[first], None]
@@ -126,13 +125,11 @@ class View:
         )
 
     def transitions(self, index: Index, n_step: int = 1, gamma: float = 0.99) -> Transitions:
-        """The n-step transitions that `index` numbers, as the agent sees them.
-
-        Both ends are shifted and corrupted on their own.
+        """n-step transitions; `obs` and `next_obs` are shifted and corrupted independently.
 
         Args:
-            index: (B,) numbers in 0..num_transitions-1; they count the rows that have a successor, in order.
-            n_step: rewards to sum, as `Dataset.n_step_returns` does; fewer at an episode's end.
+            index: (B,) transition numbers in 0..num_transitions-1, counting the rows with a successor, in order.
+            n_step: number of rewards to sum, fewer at an episode's end; see `Dataset.n_step_returns`.
             gamma: discount between the summed rewards.
 
         Raises:
@@ -152,7 +149,7 @@ class View:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the streams stand."""
+        """Positions of the random streams."""
         return {"corruption": int(self.corruption.stream.position), "shift": int(self.shifts.position)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -161,14 +158,14 @@ class View:
         self.shifts.go_to(state["shift"])
 
     def _observe_by_lines(self, rows: Tensor, shift_key: Tensor, keys: Tensor) -> Tensor:
-        """The same for a set on a CPU: only frames that stay are read, shifted, changed, and put into their stacks."""
+        """`observe` for a data set on a CPU: reads, shifts and corrupts only frames that are not zeroed."""
         corruption, frames, stack = self.corruption.corruption, self.dataset.frames, self._frame_stack
         keys = keys.flatten()
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
-        # One image more than are chosen: the frame of zeros that `_spread` reads.
+        # One more image than chosen: the zero frame for `_spread`.
         images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
-        # All frames under one key lie one after the other.
+        # Frames with the same shift key are consecutive.
         offset = augmentation.draw_offset(shift_key, self._pad).repeat_interleave(
             chosen.numel() // max(1, len(shift_key)), 0
         )
@@ -179,7 +176,7 @@ class View:
 
 
 class StateView(View):
-    """Simulator states in place of pixels, as an encoder of states observes them."""
+    """Simulator states instead of pixels, as the input of an encoder of states."""
 
     def __init__(
         self,
@@ -189,25 +186,25 @@ class StateView(View):
         seed: int,
         *name: str | int,
     ) -> None:
-        """See the class.
+        """Initialise.
 
         Args:
-            dataset: a set with simulator states.
-            observed: observations (..., P, 1, 1) of (..., P) states and (...,) int64 keys, `StateFrame.observe`.
-            corruption: keys are drawn as its are; its stages, which change pixels, play no part.
+            dataset: a data set with simulator states.
+            observed: `StateFrame.observe`: (..., P) states and (...,) int64 keys -> (..., P, 1, 1) observations.
+            corruption: only its mode is used, to draw the keys; its stages change pixels.
             seed: the run's seed.
-            name: tells the views of a run apart.
+            name: name of the view's random streams.
         """
         super().__init__(dataset, corruption, 0, seed, *name)
         self._states, self._observed = dataset.states(), observed
 
     def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
-        """(..., P, 1, 1) float32 of (...,) int64 rows; nothing is shifted."""
+        """Observations (..., P, 1, 1) float32 of (...,) int64 rows; there is no shift."""
         return self._observed(self._states[rows], self.corruption.keys(self.dataset.keys(rows)))
 
 
 def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
-    """Put frames at their (N, K) places in stacks of zeros; `images` has room for one of zeros behind them."""
+    """Put frames at places `kept` (N, K) of otherwise zero stacks; the last of `images` becomes the zero frame."""
     images[-1] = 0
     source = torch.full((len(kept), stack), kept.numel())
     source.scatter_(1, kept, torch.arange(kept.numel()).view(kept.shape))
@@ -216,9 +213,9 @@ def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
 
 
 class Sampler:
-    """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a random stream.
+    """Base class of samplers: a view (if a data set is given, of its stored pixels), a batch size, a random stream.
 
-    The stream is drawn on the CPU, so the batches do not depend on the set's device.
+    Random numbers are drawn on the CPU, so the batches do not depend on the data set's device.
     """
 
     def __init__(self, source: Dataset | View, batch_size: int, draws: RandomStream) -> None:
@@ -227,7 +224,7 @@ class Sampler:
         self._batch_size, self.draws = batch_size, draws
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on with the same batches."""
+        """Everything needed to continue with the same batches."""
         return {"batches": self.draws.get_state(), "view": self.view.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -240,7 +237,7 @@ class Sampler:
 
 
 class WindowSampler(Sampler):
-    """Windows whose starts are uniform over the set, drawn with replacement."""
+    """Samples windows uniformly over the data set, with replacement."""
 
     def __init__(self, source: Dataset | View, batch_size: int, length: int, draws: RandomStream) -> None:
         super().__init__(source, batch_size, draws)
@@ -256,7 +253,7 @@ class WindowSampler(Sampler):
 
 
 class TransitionSampler(Sampler):
-    """n-step transitions uniform over the set, drawn with replacement."""
+    """Samples n-step transitions uniformly over the data set, with replacement."""
 
     def __init__(
         self,

@@ -1,12 +1,12 @@
-"""The contracts of parts of one's own, for a package's own tests: one line checks a part that is registered by name.
+"""Conformance checks for user-defined parts: one line in your tests checks a part that is registered by name.
 
     from vd4rl_pomdp.testing import check_method
 
     def test_my_method():
         check_method("past_to_frame")
 
-Each function makes the part at a small size, puts it to every check of its kind, and raises AssertionError saying which
-promise is broken, and by what. An unknown name or option raises UserError.
+Each function builds the part at a small size, runs every check of its kind, and raises an AssertionError that says
+which promise is broken and how. An unknown name or option raises UserError.
 """
 
 from vd4rl_pomdp.testing.algorithms import check_algorithm

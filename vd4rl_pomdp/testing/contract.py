@@ -1,4 +1,4 @@
-"""What the contracts of all kinds share: how a check is run, and in which words a broken promise is told."""
+"""Helpers shared by all conformance checks: run checks and report broken promises."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from torch import Tensor
 from vd4rl_pomdp.core.errors import UserError
 
 Check = Callable[..., None]
-"""Called with a part's name and its options; the first line of its docstring is the promise that it checks."""
+"""Called with a part's name and options; the first line of its docstring is the promise printed if it fails."""
 
 
 def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
-    """Check one promise of a part; the global generators of torch and numpy are left where they were.
+    """Run one check on a part; the global random states of torch and numpy are restored afterwards.
 
     Args:
-        kind: what the part is called, `method`.
-        check: raises AssertionError, or anything that the part's own code raises.
-        name: of the part.
+        kind: kind of part, such as "method".
+        check: raises AssertionError, or any exception of the part's own code.
+        name: name of the part.
         options: its options.
 
     Raises:
-        AssertionError: the promise is broken; says which one, by what and of which part.
+        AssertionError: the promise is broken; the message names the part, the promise and the reason.
         UserError: there is no such part or option.
     """
     try:
@@ -41,7 +41,7 @@ def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
 
 @contextmanager
 def _generators_kept() -> Iterator[None]:
-    """Leave the global generators of torch and numpy, which checks seed, where the caller had them."""
+    """Restore the global random states of torch and numpy, which checks seed."""
     drawn = np.random.get_state()  # noqa: NPY002
     with torch.random.fork_rng(devices=[]):
         try:
@@ -51,26 +51,26 @@ def _generators_kept() -> Iterator[None]:
 
 
 def run_checks(kind: str, checks: Iterable[Check], name: str, **options: Any) -> None:
-    """`run_check` for one check after the other."""
+    """Run several checks with `run_check`."""
     for check in checks:
         run_check(kind, check, name, **options)
 
 
 def promise(check: Check) -> str:
-    """What a check is about, as one sentence."""
+    """The promise that a check tests: the first line of its docstring."""
     return (check.__doc__ or "").partition("\n")[0]
 
 
 def claim(holds: Any, otherwise: str) -> None:
-    """Raise AssertionError, saying what is the case, unless something holds."""
+    """Raise AssertionError with the message `otherwise` unless `holds`."""
     if not holds:
         raise AssertionError(otherwise)
 
 
 def claim_close(found: Tensor, expected: Tensor, otherwise: str, tolerance: float | None = None) -> None:
-    """Raise AssertionError, saying what is the case and by how much, unless two tensors agree.
+    """Raise AssertionError with the message `otherwise` and the difference unless two tensors are close.
 
-    They do to a relative and absolute `tolerance`, by default to the precision of their dtype.
+    `tolerance` is relative and absolute; default: torch.testing's for the dtype.
     """
     torch.testing.assert_close(
         found, expected, rtol=tolerance, atol=tolerance, msg=lambda difference: f"{otherwise}: {difference}"
@@ -78,5 +78,5 @@ def claim_close(found: Tensor, expected: Tensor, otherwise: str, tolerance: floa
 
 
 def shown(names: Iterable[str]) -> str:
-    """Names as they stand in a message, in order."""
+    """Sorted names, joined for a message; "none" if there are none."""
     return ", ".join(sorted(names)) or "none"

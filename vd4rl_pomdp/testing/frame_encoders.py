@@ -1,4 +1,4 @@
-"""What every frame encoder must satisfy: shapes, no mixing of pictures, gradients, and a folder that gives it back."""
+"""Conformance checks of frame encoders: shapes, no mixing of images, gradients, determinism, saving and loading."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ CHANNELS = 3 * FRAME_STACK
 
 
 def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> None:
-    """Check every promise of a frame encoder.
+    """Run all checks on a frame encoder.
 
     Args:
-        name: of the frame encoder in `vd4rl_pomdp.nn.frame.FRAME_ENCODERS`.
-        size: height and width of the pictures that it is to read.
+        name: name in `vd4rl_pomdp.nn.frame.FRAME_ENCODERS`.
+        size: height and width of the images to read.
         options: its options.
 
     Raises:
-        AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such frame encoder or option, it cannot read pictures of that size or makes no maps of
-            them, or a setting of the training has an option's name.
+        AssertionError: a promise is broken; the message says which and how.
+        UserError: there is no such frame encoder or option, it cannot read images of that size or returns no maps, or
+            an option has the name of a pretraining setting.
     """
     PretrainConfig.of("smoke", frame_encoder=name, **options)
     run_checks("frame encoder", CHECKS, name, size=size, **options)
 
 
 def make(name: str, size: int = FRAME_SIZE, **options: Any) -> Encoder:
-    """A memoryless encoder with the frame encoder, the same at every call."""
+    """A memoryless encoder with the frame encoder; identical at every call."""
     config = PretrainConfig.of("smoke", method="curl", frame_encoder=name, **options)
     torch.manual_seed(0)
     return build_objective(config, 2, None, observation=(CHANNELS, size)).encoder
 
 
 def pictures(count: int, size: int = FRAME_SIZE) -> Tensor:
-    """(count, C, size, size) uint8 random pictures, the same at every call."""
+    """Random images (count, C, size, size) uint8; identical at every call."""
     shape = (count, CHANNELS, size, size)
     return torch.randint(0, 256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
@@ -69,7 +69,7 @@ def pictures_are_not_mixed(name: str, **options: Any) -> None:
     obs = pictures(3, options["size"]).float().requires_grad_()
     for training in (False, True):
         features = make(name, **options).frame.train(training)(obs)
-        # not the plain sum, which a layer norm makes a constant
+        # random weights, since a layer norm makes the plain sum constant
         weights = torch.randn(features.shape[-1], generator=torch.Generator().manual_seed(0))
         (gradient,) = torch.autograd.grad((features[1] * weights).sum(), obs)
         reached = gradient.flatten(1).abs().amax(1) > 0

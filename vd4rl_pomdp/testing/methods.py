@@ -1,4 +1,4 @@
-"""What every pretraining method must satisfy: losses, gradients, state, padding, streaming, resumption, visibility."""
+"""Conformance checks of pretraining methods: loss, gradients, padding, streaming, resuming, visibility."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, 
 ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
 _SMALLEST = {"max_k": 4, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
-"""A proof takes a backward pass for every pair; of very few units in the head all may be rectified to zero."""
+"""For visibility checks, which take a backward pass per pair; with fewer units all ReLUs of the head may be zero."""
 _PICTURE, _GRID = (9, 84), (9, 2)
-"""Channels and size of an observation, and of one that is encoded without convolutions."""
+"""Channels and image size: the benchmark's, and a tiny one for the frame encoder `flat`."""
 
 
 def check_method(name: str, **settings: Any) -> None:
-    """Check every promise of a method.
+    """Run all checks on a method.
 
     Args:
-        name: of the method in `pretrain.objectives.METHODS`.
-        settings: of `vd4rl-pomdp pretrain`: the method's options, `history`, `frame_encoder`, ...
+        name: name in `pretrain.objectives.METHODS`.
+        settings: settings of `vd4rl-pomdp pretrain`: the method's options, `history`, `frame_encoder`, ...
 
     Raises:
-        AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such method or setting, or something chosen beside it has a setting of the same name.
+        AssertionError: a promise is broken; the message says which and how.
+        UserError: there is no such method or setting, or two chosen parts have an option of the same name.
     """
     PretrainConfig.of("smoke", **({"method": name, "corruption": CORRUPTIONS[-1]} | settings))
     run_checks("method", checks_of(name, **settings), name, **settings)
 
 
 def checks_of(name: str, **settings: Any) -> tuple[Check, ...]:
-    """The checks that a method has to pass: all encode, those that are trained have a loss, some predict actions."""
+    """Checks for a method: ENCODING for all, TRAINED if it is trained, INVERSE if it predicts actions."""
     trained = TRAINED if METHODS.named(name).trained else ()
     return ENCODING + trained + (INVERSE if predicts_actions(name, **settings) else ())
 
@@ -55,12 +55,12 @@ def predicts_actions(name: str, **settings: Any) -> bool:
 
 
 def build(name: str, **settings: Any) -> Objective:
-    """A small objective of a method, the same at every call; without convolutions, which are no part of a method."""
+    """A small objective of a method, identical at every call; without convolutions, which all methods share."""
     return _build(name, _SMALL, _PICTURE, {"frame_encoder": "flat"} | settings)
 
 
 def build_inverse(name: str, **settings: Any) -> InverseObjective:
-    """An inverse model in float64, small enough to try each of its inputs; its pictures are encoded as they are."""
+    """An inverse model in float64, small enough to perturb each input; by default its frame encoder is `flat`."""
     settings = {"frame_encoder": "flat"} | settings
     observation = _GRID if settings["frame_encoder"] == "flat" else _PICTURE
     return cast(InverseObjective, _build(name, _SMALLEST, observation, settings).double())
@@ -75,11 +75,11 @@ def _build(name: str, small: dict[str, int], observation: tuple[int, int], setti
 
 
 def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool = False) -> Windows:
-    """Windows of random pictures or simulator states and actions, which end in padding where they are shorter."""
+    """Windows of ROWS random images (or simulator states) and actions, with `lengths` real rows each, then padding."""
     g = torch.Generator().manual_seed(seed)
     shape = (STATE, 1, 1) if state else (9, 4, 4)
     obs = torch.randint(0, 256, (len(lengths), ROWS, *shape), generator=g, dtype=torch.uint8)
-    if not state:  # blocks of 21 pixels, which a shift leaves recognisable
+    if not state:  # blocks of 21 pixels, which remain recognisable under a shift
         obs = obs.repeat_interleave(21, -1).repeat_interleave(21, -2)
     length = torch.tensor(lengths)
     has_action = torch.arange(ROWS) < length[:, None] - 1
@@ -89,7 +89,7 @@ def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool
 
 
 def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0) -> Windows:
-    """The windows of `batch`, as the training of a method is given them: with random states if it regresses them."""
+    """`batch` as in the method's training: with random simulator states if it regresses them."""
     plain = batch(lengths, seed)
     if not METHODS.named(name).regresses_state:
         return plain
@@ -141,7 +141,7 @@ def steps_lower_the_loss(name: str, **settings: Any) -> None:
 
 
 def _train(name: str, objective: Objective, optimiser: torch.optim.Optimizer, batches: Iterable[int]) -> list[float]:
-    """Make a step on each batch; its losses."""
+    """Take one optimiser step per batch number; returns the losses."""
     losses = []
     for number in batches:
         loss, _ = objective.loss(windows(name, seed=number), 0.0)
@@ -176,11 +176,11 @@ def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings
 
 
 def _elsewhere(name: str, objective: Objective, **settings: Any) -> Objective:
-    """Another objective with the state of a given one."""
+    """A new objective with the state_dict of the given one."""
     other = build(name, **settings)
     with torch.no_grad():
         for parameter in other.parameters():
-            parameter.add_(0.1)  # or what no state holds would be right by the equal seed
+            parameter.add_(0.1)  # else parameters missing from the state_dict would match by the equal seed
     other.load_state_dict(copy.deepcopy(objective.state_dict()))
     return other
 
@@ -224,7 +224,7 @@ def optional_terms_are_added(name: str, **settings: Any) -> None:
 def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: Any) -> None:
     """`action_loss` is the mean of -log P(a_t | ...) over all real pairs (t, t+k), and `loss_kNN` over those of a k."""
     objective, window = cast(InverseObjective, build(name, **settings)), batch()
-    logits = copy.deepcopy(objective).action_logits(window)  # of the same draws as the loss below
+    logits = copy.deepcopy(objective).action_logits(window)  # a copy, so that the loss below makes the same draws
     alone: dict[int, list[torch.Tensor]] = {}
     for p, (t, k) in enumerate(objective.pairs(ROWS).tolist()):
         for b, length in enumerate(window.length.tolist()):
@@ -239,12 +239,12 @@ def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: An
 
 def predictions_depend_on_what_is_declared(name: str, **settings: Any) -> None:
     """The prediction of each pair depends on all that `visible` and `visible_frames` declare, and on nothing else."""
-    for training in (False, True):  # a norm over the batch mixes rows in training alone
+    for training in (False, True):  # batch norm mixes rows only in training mode
         claim_visibility(build_inverse(name, **settings).train(training), [ROWS, ROWS, 4], ROWS)
 
 
 def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int) -> None:
-    """Raise AssertionError, naming the first pair that is wrong, unless an objective sees what it declares."""
+    """Raise AssertionError with the first failing pair unless an objective depends on exactly what it declares."""
     for frames in (False, True):
         wrong = wrong_pairs(objective, lengths, rows, frames)
         if not wrong:
@@ -261,7 +261,7 @@ def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int)
 
 
 ENCODING: tuple[Check, ...] = (streaming_equals_batch,)
-"""Of all methods."""
+"""For all methods."""
 TRAINED: tuple[Check, ...] = (
     a_loss_is_a_finite_scalar,
     a_loss_moves_the_whole_encoder,
@@ -269,11 +269,11 @@ TRAINED: tuple[Check, ...] = (
     a_training_that_goes_on_elsewhere_takes_the_same_steps,
     padding_changes_no_loss,
 )
-"""Of methods that take gradient steps."""
+"""For methods that are trained."""
 INVERSE: tuple[Check, ...] = (
     every_action_target_is_taken,
     optional_terms_are_added,
     the_action_loss_is_that_of_each_pairs_first_action,
     predictions_depend_on_what_is_declared,
 )
-"""Of those that predict actions."""
+"""For methods that predict actions."""
