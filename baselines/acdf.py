@@ -2,21 +2,21 @@
 
     P(a_t | e(o_t), e(o_{t+k})), k in 1..K,   and   ||g(e(o_t), a_t) - sg(e(o_{t+1}))||^2 / D
 
-Multi-step inverse models alone may merge states that differ under control, as where a walk has a period: the two ends
-of every pair tell the action all the same. A state that must also predict the next one keeps them apart. The inverse
-loss holds the representation: a constant one would be predicted best.
+A multi-step inverse model alone may merge states that differ under control, for example in periodic dynamics, where a
+pair's two ends still determine the action. Requiring that a state also predicts the next one separates them. The
+inverse loss in turn prevents collapse: a constant representation would have zero forward loss.
 
 Authors' code: github.com/midi-lab/acdf (grid worlds, on the code of AC-State).
 
 Differences:
-- The state is continuous, because TD3+BC needs one, and g regresses the next one. Theirs is one of a number of codes
-  (vector quantisation), and g a classifier over them; the proof is for finite states.
-- As there, no gradient reaches the encoder by the state that is predicted, and by the one predicted from in every fifth
-  update alone (`--forward-every`); both losses weigh 1 (`--forward-weight`).
-- g has three hidden layers of 512, theirs of 1024; theirs are leaky.
-- All pairs of a window are scored at once, and every (t, t+1) of it predicted; theirs draws one k for each transition.
-- Continuous actions: the inverse model's target is a choice, and g is given a_t itself; theirs are one of a few.
-- A window shares one random shift, since g could not foresee that of the next row; the authors do not augment.
+- The state is continuous, because TD3+BC needs that, and g regresses the next state. Theirs is discrete (vector
+  quantisation) and g a classifier over the codes; their proof is for finite states.
+- As in their code, the forward loss sends no gradient into its target, and into its input only in every fifth update
+  (`--forward-every`). Both losses have weight 1 (`--forward-weight`).
+- g has three hidden layers of 512 with ReLU; theirs has 1024 with leaky ReLU.
+- All pairs of a window, and all its transitions (t, t+1), are used at once; theirs samples one k per transition.
+- Actions are continuous: the inverse model's target is configurable, and g reads a_t itself; theirs are discrete.
+- A window shares one random shift, since g could not predict the shift of the next row; the authors do not augment.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class ACDFOptions(InverseOptions):
     forward_weight: float = 1.0
     """Weight of the latent forward model's loss."""
     forward_every: int = 5
-    """Updates of which one lets the forward loss's gradient into the encoder."""
+    """The forward loss updates the encoder only in every n-th gradient step."""
 
     limits: ClassVar[Limits] = {"forward_weight": 0, "forward_every": 1}
 
 
 class ACDF(LatentForward):
-    """ACRO's inverse model, and a forward model on its states."""
+    """ACRO's inverse model plus a forward model on its states."""
 
     updates: Tensor
 
@@ -57,8 +57,8 @@ class ACDF(LatentForward):
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
 
     def forward_ends(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """The target takes no gradient, what is predicted from in one of `forward_every` updates."""
-        # a gate of 0 or 1, not a branch: a step that is replayed does the same in every update
+        """No gradient to the target; gradient to the input in one of `forward_every` updates."""
+        # a gate of 0 or 1 instead of an `if`, which a captured CUDA graph would freeze
         gate = (self.updates % self.forward_every == 0).to(states)
         now, following = states[:, :-1], states[:, 1:].detach()
         return now.detach() + gate * (now - now.detach()), following

@@ -2,22 +2,23 @@
 
     L = -log exp(q^T W k+) / sum_i exp(q^T W k_i),   q = e(aug(o)), k = e'(aug'(o)),   e' <- 0.95 e' + 0.05 e
 
-Two augmentations of one observation are a positive pair, other observations of the batch the negatives; W is a learned
-bilinear form, e' a momentum copy of the encoder that takes no gradient.
+Two augmentations of one observation form a positive pair; other observations of the batch are negatives. W is a learned
+bilinear form and e' a momentum copy of the encoder, without gradient.
 
 Authors' code: github.com/MishaLaskin/curl.
 
 Differences:
-- The contrastive loss alone: the paper trains it together with SAC on the same encoder.
+- Only the contrastive loss is trained; the paper trains it together with SAC on the same encoder.
 - Augmentation is a random shift by up to 4 pixels, as everywhere in this benchmark, not a random crop of a larger
-  frame; both copies are shifted from one corrupted observation, which is not shifted itself: hiding is the world's
-  doing, no augmentation, and a shift that both copies share would tell them from the negatives.
-- The paper subtracts each row's largest logit before the softmax; here log-softmax does it.
-- Observations of the anchor's own window are no negatives: the authors draw their batch one by one, from a buffer in
-  which hardly two are neighbours.
-- The authors contrast 50 features that pass through a layer norm and no tanh; here it is the encoder's own output.
-- They move e' at every second step (both with 0.05) and let two optimisers step the encoder; here it is one each step.
-- With `--history gru` the GRU is part of e and e', and one shift serves a whole window.
+  frame. Both copies are shifted versions of one corrupted, unshifted observation: the corruption belongs to the
+  environment, not to the augmentation, and a shift common to both copies would distinguish them from the negatives.
+- The paper subtracts each row's largest logit before the softmax; here log-softmax does that.
+- Observations of the anchor's own window are not negatives. The authors sample single observations from a buffer, of
+  which hardly two are neighbours in time.
+- The authors contrast 50 features after a layer norm without tanh; here it is the encoder's own output.
+- They update e' every second step (also by 0.05) and step the encoder with two optimisers; here it is every step and
+  one optimiser.
+- With `--history gru` the GRU is part of e and e', and a window is shifted as a whole.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from vd4rl_pomdp.nn.heads import info_nce, move_target, share_found
 from vd4rl_pomdp.nn.objective import Objective
 
 MOMENTUM = 0.05
-"""Share of the encoder that its momentum copy takes over after every step."""
+"""tau in e' <- (1 - tau) e' + tau e, after every step."""
 
 
 class CURL(Objective):
@@ -57,17 +58,17 @@ class CURL(Objective):
             positive = self.momentum_encoder.encode(self._shifted(window))
         batch, rows = query.shape[:2]
         group = torch.arange(batch, device=query.device).repeat_interleave(rows)
-        # flat over windows and rows: the group tells which rows are neighbours of the anchor, and no negatives
+        # flattened over windows and rows; rows of the anchor's own group (window) are not negatives
         scores = query.flatten(0, 1) @ self.bilinear @ positive.flatten(0, 1).T
         counted = group, window.real.flatten()
         loss = info_nce(scores, *counted)
         return loss, {"loss": loss.detach(), "accuracy": share_found(scores, *counted)}
 
     def after_step(self) -> None:
-        """Move the momentum encoder."""
+        """Update the momentum encoder."""
         move_target(self.momentum_encoder, self.encoder, MOMENTUM)
 
     def _shifted(self, window: Windows) -> Windows:
-        """The window, shifted anew: each row by itself, or all alike if the encoder has a memory."""
+        """The window with a new random shift: per row, or one for the whole window if the encoder has a memory."""
         obs = window.obs if self.encoder.memory is not None else window.obs.flatten(0, 1)
         return window.replace(obs=random_shift(obs, self.draws.keys(len(obs))).view_as(window.obs))

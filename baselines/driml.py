@@ -2,24 +2,24 @@
 
     L = sum over N, M in {local, global} of InfoNCE[ psi_N(s_t, a_t), phi_M(s_{t+k}) ]
 
-A state and its action must tell the state k steps later from those k steps after all other rows of the batch, those of
-its own window among them. "Global" is the encoder's output, "local" its feature map, place by place; all four
-combinations are trained, each with projections of its own. A score is the inner product of projections over sqrt(64),
+A state and its action must identify the state k steps later among the states k steps after all other rows of the batch,
+including rows of the same window. "Global" is the encoder's output, "local" each position of its feature map. All four
+combinations are trained, each with its own projections. A score is the inner product of the projections / sqrt(64),
 softly clipped to -20..20.
 
 Authors' code: github.com/bmazoure/DRIML (within a C51 agent for Procgen).
 
 Differences:
-- The contrastive loss alone, without the reward-driven agent; the mean of all four terms, which the authors weigh.
-- Every observation is shifted by itself; the authors do not augment (`--shift 0`). A shift that a window shares would
-  tell the positive from all negatives of other windows, and the loss would fall without any knowledge of the state.
-- k is drawn for every batch, from 1..2 as the authors' variant with random k draws it for every transition;
-  `--max-k` sets another K. Their other variants fix it or adapt it to the game.
-- Actions are continuous and enter psi by concatenation; the paper embeds discrete ones.
-- Feature maps larger than 7x7 are averaged to 7x7 (DrQ's convolutions leave 35x35 places).
-- A batch is windows of consecutive rows, so that many negatives are near the positive in time; the authors draw theirs
-  one by one.
-- Batches of windows whose encoder has a memory (`--history gru`) are shifted row by row, too, for the same reason.
+- Only the contrastive loss is trained, without the RL agent. The four terms are averaged; the authors weight them.
+- Every observation is shifted independently; the authors do not augment (`--shift 0`). A shift shared by a window would
+  identify the positive among negatives of other windows, and the loss would fall without any knowledge of the state.
+- k is sampled once per batch, from 1..2 by default (`--max-k`); the authors' variant with random k samples it from 1..2
+  per transition. Their other variants fix k or adapt it to the game.
+- Actions are continuous and concatenated to psi's input; the paper embeds discrete actions.
+- Feature maps larger than 7x7 are average-pooled to 7x7 (DrQ's convolutions give 35x35).
+- A batch consists of windows of consecutive rows, so many negatives are close to the positive in time; the authors
+  sample single transitions.
+- Observations are shifted independently even if the encoder has a memory (`--history gru`), for the same reason.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from vd4rl_pomdp.nn.heads import info_nce, mlp
 from vd4rl_pomdp.nn.objective import Objective
 
 PLACES = 7
-"""Largest height and width of the local maps."""
+"""Largest height and width of the pooled feature maps."""
 SCORE_DIM = 64
 TERMS = (("g", "g"), ("g", "l"), ("l", "g"), ("l", "l"))
-"""What is contrasted, the anchor's feature and the candidate's: g global, l local."""
+"""The four terms as (anchor, candidate): g global, l local."""
 LARGEST_SCORE = 20.0
-"""Scores are clipped to this by a tanh."""
+"""A tanh bounds scores to +-20."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class DRIMLOptions(Options):
     """Options of DRIML."""
 
     max_k: int = 2
-    """Largest gap K between the two states; k is drawn from 1..K for every batch."""
+    """Largest gap K between the two states; k is sampled from 1..K once per batch."""
 
     limits: ClassVar[Limits] = {"max_k": 1}
 
 
 class DRIML(Objective):
-    """Action-conditioned InfoNCE across k steps, on local and global features."""
+    """Action-conditioned InfoNCE between rows t and t+k, on local and global features."""
 
     def __init__(self, encoder: Encoder, target: ActionTarget, options: DRIMLOptions, seed: int) -> None:
         super().__init__()
@@ -74,12 +74,12 @@ class DRIML(Objective):
         self.draws = Draws(seed, "driml", "k")
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean of the four InfoNCE terms at one k; `loss_gl` is a global anchor with local candidates."""
+        """Mean of the four InfoNCE terms at one k; `loss_gl`, for example, has a global anchor and local candidates."""
         rows = window.obs.shape[1]
         k = 1 + self.draws.integers(min(self.max_k, rows - 1))
         maps = self._frame.maps(window.obs)
         states = self.encoder.from_features(self._frame.from_maps(maps), window.prev_action)
-        # a step that is replayed has one shape, whatever k is: there rows that have no later one are left out by `real`
+        # CUDA graphs need the same shapes for every k: there, `real` masks the rows that have no row t+k
         anchors = rows - (int(k) if buffers.in_host_memory(k) else 1)
         there = torch.arange(anchors, device=k.device) + k
         real = (there < window.length[:, None]).flatten()
@@ -98,15 +98,18 @@ class DRIML(Objective):
         return self.encoder.frame
 
     def _places(self, maps: Tensor) -> Tensor:
-        """(B, T, C, H, W) -> (B, T, places, C), at most 7x7 places."""
+        """Pool feature maps to at most 7x7 places: (B, T, C, H, W) -> (B, T, places, C)."""
         size = (min(PLACES, maps.shape[-2]), min(PLACES, maps.shape[-1]))
         pooled = F.adaptive_avg_pool2d(maps.float().flatten(0, 1), size)
         return pooled.flatten(2).transpose(1, 2).unflatten(0, maps.shape[:2])
 
     def _scores(self, term: str, now: Tensor, action: Tensor, later: Tensor) -> Tensor:
-        """(N, L or 1, F), (N, A), (N, L or 1, F') -> (L, N, N): place against the same place, or against the whole."""
+        """Scores of anchors by candidates: (N, L or 1, F), (N, A), (N, L or 1, F') -> (L, N, N).
+
+        L counts places: local features are compared at the same place, a global one with every place.
+        """
         both = torch.cat([now, action[:, None].expand(-1, now.shape[1], -1).to(now)], dim=-1)
         anchors, candidates = self.anchors[term](both), self.candidates[term](later)
         scores = anchors.transpose(0, 1) @ candidates.permute(1, 2, 0) / SCORE_DIM**0.5
-        # soft, because beyond a hard bound no gradient would bring a score back
+        # tanh instead of clamp, which has no gradient beyond its bounds
         return LARGEST_SCORE * (scores.float() / LARGEST_SCORE).tanh()

@@ -1,22 +1,23 @@
-"""HOMER: kinematic inseparability by telling real from imposter transitions (Misra et al. 2019, arXiv 1911.05815).
+"""HOMER: kinematic inseparability by classifying real against imposter transitions (Misra et al., arXiv 1911.05815).
 
-    P(real | e(o_t), a_t, c(e(o_{t+1}))),   imposters: o_{t+1} drawn independently of (o_t, a_t)
+    P(real | e(o_t), a_t, c(e(o_{t+1}))),   imposters: o_{t+1} sampled independently of (o_t, a_t)
 
-The Bayes-optimal classifier is p(o'|o,a) / (p(o'|o,a) + p(o')): observations that no (o, a) can tell apart may share a
-code. c is a discrete bottleneck, Gumbel-softmax over a few codes, or the identity.
+The Bayes-optimal classifier is p(o'|o,a) / (p(o'|o,a) + p(o')), so observations that no (o, a) distinguishes may share
+a code. c is a discrete bottleneck (Gumbel-softmax over a few codes) or the identity.
 
 Authors' code: github.com/microsoft/Intrepid (Homer).
 
 Differences:
-- The abstraction alone: no exploration policies, no tabular planning on the codes.
-- One encoder for o_t and o_{t+1}; the authors share the convolutions and give each its own last layer, of which the
-  second is kept.
-- Imposters come from the batch, each a uniformly drawn next observation of it; one for each real transition.
-- Every observation is shifted by itself; the authors do not augment (`--shift 0`). A shift shared by a window would
-  tell real transitions from imposters of other windows.
-- The authors train without the bottleneck first and go on with it; here it is there from the beginning or not at all.
-- The bottleneck is an option (`--homer-codes`), since TD3+BC needs a continuous state; the kept z is before it.
-- With `--history gru` the state of row t+1 remembers row t, which makes imposters easy: use it knowing that.
+- Only the state abstraction is learned: no exploration policies, no tabular planning on the codes.
+- One encoder for o_t and o_{t+1}; the authors share the convolutions, use a separate last layer for each, and keep the
+  second.
+- The imposter of a real transition is a next observation sampled uniformly from the batch; there is one per transition.
+- Every observation is shifted independently; the authors do not augment (`--shift 0`). A shift shared by a window would
+  distinguish real transitions from imposters of other windows.
+- The authors train without the bottleneck first and then add it; here it is used from the start or not at all.
+- The bottleneck is optional (`--homer-codes`), since TD3+BC needs a continuous state; the saved representation is the
+  one before it.
+- With `--history gru` the state at t+1 remembers row t, which makes imposters easy to spot. Interpret it accordingly.
 """
 
 from __future__ import annotations
@@ -47,13 +48,13 @@ class Bottleneck(nn.Module):
         self.draws = Draws(seed, "homer", "gumbel")
 
     def forward(self, z: Tensor) -> Tensor:
-        """Embedding of each row's code; noise in training alone."""
+        """Embedding of each row's code; with Gumbel noise in training mode only."""
         logits = self.logits(z)
         if self.training:
             logits = logits - (-self.draws.uniform(*logits.shape).log()).log()
         soft = logits.softmax(-1)
         hard = (logits.argmax(-1, keepdim=True) == torch.arange(soft.shape[-1], device=soft.device)).to(soft)
-        return self.embedding(hard + soft - soft.detach())  # forward one code, backward the softmax
+        return self.embedding(hard + soft - soft.detach())  # one-hot forward, softmax gradient backward
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,13 @@ class HOMEROptions(Options):
     """Options of HOMER."""
 
     homer_codes: int = 0
-    """Codes of its discrete bottleneck; 0 for none."""
+    """Number of codes of the discrete bottleneck; 0: no bottleneck."""
 
     limits: ClassVar[Limits] = {"homer_codes": 0}
 
 
 class HOMER(Objective):
-    """Real or imposter (o_t, a_t, o_{t+1})."""
+    """Classifies transitions (o_t, a_t, o_{t+1}) as real or imposter."""
 
     def __init__(self, encoder: Encoder, target: ActionTarget, options: HOMEROptions, seed: int) -> None:
         super().__init__()
@@ -77,17 +78,17 @@ class HOMER(Objective):
         self.draws = Draws(seed, "homer", "imposters")
 
     def logits(self, state: Tensor, action: Tensor, following: Tensor) -> Tensor:
-        """Log-odds (N,) that transitions of (N, D), (N, A), (N, D) are real."""
+        """Log-odds (N,) that transitions, given as (N, D), (N, A), (N, D), are real."""
         return self.classifier(torch.cat([state, action.to(state), self.bottleneck(following)], dim=-1))[:, 0]
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean binary cross-entropy of every real transition of the batch and one imposter for each."""
+        """Mean binary cross-entropy over all real transitions of the batch and one imposter for each."""
         states = self.encoder.encode(window)
         pairs = states[:, :-1], window.action[:, :-1], states[:, 1:]
         state, action, following = (x.flatten(0, 1) for x in pairs)
         real = window.real[:, 1:].flatten()
         count, real_first = real.sum(), (~real).int().argsort(stable=True)
-        # now and then the true one is drawn: p(o') is the batch's own distribution, which contains it
+        # may sample the true next observation: imposters follow p(o') of the batch, which contains it
         imposter = following[real_first[self.draws.integers(count, len(following))]]
         logits = torch.stack([self.logits(state, action, following), self.logits(state, action, imposter)])
         truth = torch.zeros_like(logits)

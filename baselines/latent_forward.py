@@ -1,4 +1,4 @@
-"""What inverse models with a latent forward model share: ACDF and SMWM."""
+"""Base class of inverse models with a latent forward model: ACDF and SMWM."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from vd4rl_pomdp.nn.objective import StateInverse
 
 
 class LatentForward(StateInverse):
-    """An inverse model whose states must also tell the next one, given the action: ||g(s_t, a_t) - s_{t+1}||^2 / D."""
+    """An inverse model with a forward loss on its states: ||g(s_t, a_t) - s_{t+1}||^2 / D."""
 
     def __init__(self, encoder: Encoder, target: ActionTarget, options: Any, seed: int) -> None:
-        """`options` are `ActionOptions` with a `forward_weight`."""
+        """Initialise; `options` are `ActionOptions` with a field `forward_weight`."""
         super().__init__(encoder, target, options, seed)
         self.forward_weight: float = options.forward_weight
         self.forward_model = mlp(encoder.dim + encoder.config.action_dim, 512, encoder.dim, layers=3)
 
     @abstractmethod
     def forward_ends(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Of states (B, T, D) what is predicted from and what is predicted, (B, T - 1, D): where gradients go."""
+        """Input and target of the forward model, each (B, T - 1, D), from states (B, T, D); detached where needed."""
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The inverse model's loss, and the weighted `forward_loss` over all real (t, t + 1)."""
+        """The inverse model's loss plus the weighted `forward_loss` over all real transitions (t, t + 1)."""
         states, _ = self.representations(window)
         loss, logs = self.loss_of(states, states, window, progress)
         now, following = self.forward_ends(states)

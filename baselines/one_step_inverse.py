@@ -5,8 +5,8 @@
 Authors' code: github.com/pathak22/noreward-rl (the inverse model of the intrinsic curiosity module).
 
 Differences:
-- The inverse model alone: no forward model, no curiosity reward, no policy trained with it.
-- It is ACRO with K = 1; the action target is a choice.
+- Only the inverse model: no forward model, no curiosity reward, and no policy trained with it.
+- It is ACRO with K = 1; the action target is configurable.
 - The two observations share one random shift, as in `acro --shift-shared`; the authors do not augment (`--shift 0`).
 """
 
@@ -16,4 +16,4 @@ from vd4rl_pomdp.nn.objective import StateInverse
 
 
 class OneStepInverse(StateInverse):
-    """Inverse model on consecutive states: its options have no K, so that K is 1."""
+    """Inverse model on consecutive states: K = 1, as its options have no max_k."""

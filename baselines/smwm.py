@@ -3,20 +3,21 @@ latent forward models, trained together.
 
     L = ||g(e(o_t), a_t) - e(o_{t+1})||^2 / D + lambda ||h(e(o_t), e(o_{t+1})) - a_t||^2 / A
 
-Both ends of the forward loss take its gradient: there is no stop-gradient, no momentum encoder and no regulariser of
-the states' distribution. The inverse model alone keeps the representation from collapse.
+The forward loss sends gradients into both its input and its target: no stop-gradient, no momentum encoder, and no
+regulariser on the distribution of states. Only the inverse model prevents the representation from collapsing.
 
 Authors' code: github.com/petr-ivashkov/sensorimotor-world-model.
 
 Differences:
-- The encoder is that of all methods here. Theirs is a ViT (tiny, on 224 pixels, one frame a state) with a batch norm in
-  the projection of its output to 192 numbers; here layer norm and tanh bound the states.
-- g is an MLP with three hidden layers of 512; theirs is a transformer of six layers whose norms the action modulates.
-- The inverse model has two hidden layers of 256, as theirs. Its target is a choice: K-means codes by default as in all
-  inverse models here, `--action-target mse` for theirs, on actions as stored (theirs are standardised).
-- `--forward-weight` weighs the forward loss, and so is their 1 / lambda (1 by default); Adam 3e-4, theirs AdamW 1e-4.
-- An observation here is a stack of frames, so that velocities are seen; theirs is one frame.
-- A window shares one random shift, since g could not foresee that of the next row; the authors do not augment.
+- The encoder is the one used by all methods here, whose states layer norm and tanh bound. Theirs is a ViT-Tiny on one
+  224-pixel frame, with a batch norm in the projection of its output to 192 dimensions.
+- g is an MLP with three hidden layers of 512; theirs is a 6-layer transformer with action-conditioned norm layers.
+- The inverse model has two hidden layers of 256, as theirs. Its target is configurable: K-means codes by default, as in
+  all inverse models here; `--action-target mse` is theirs, on raw actions (theirs are standardised).
+- `--forward-weight` multiplies the forward loss, so it equals their 1 / lambda (default 1). Adam with 3e-4; theirs is
+  AdamW with 1e-4.
+- An observation is a stack of frames, which shows velocities; theirs is one frame.
+- A window shares one random shift, since g could not predict the shift of the next row; the authors do not augment.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class SMWMOptions(ActionOptions):
 
 
 class SMWM(LatentForward):
-    """An inverse model on consecutive states, and a forward model between them."""
+    """An inverse model on consecutive states plus a forward model between them."""
 
     def forward_ends(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Both take the gradient."""
+        """Nothing is detached: gradients flow to both."""
         return states[:, :-1], states[:, 1:]

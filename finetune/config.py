@@ -20,20 +20,20 @@ from vd4rl_pomdp.runs.metrics import WandbMode
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneConfig(StageConfig):
-    """Settings of `vd4rl-pomdp finetune`. --algorithm decides which flags there are: name it before --help."""
+    """Settings of `vd4rl-pomdp finetune`. The flags depend on --algorithm: put it before --help."""
 
     encoder: Path = Path()
-    """Encoder folder, RUN/encoder of a pretraining run; it stays frozen but for the references bc and drq_bc. Its
-    corruption is used here too."""
+    """Encoder folder, `RUN/encoder` of a pretraining run. The encoder stays frozen, except with bc and drq_bc, which
+    train it end to end. Training and evaluation use its corruption."""
     data: Path = Path()
-    """Folder of the data set."""
+    """Dataset folder."""
     out: Path = Path()
     """Run folder; re-run the same command to resume."""
     algorithm: str = "td3_bc"
-    """Algorithm, `vd4rl-pomdp list` shows all; the references bc and drq_bc bring their own."""
+    """Algorithm; `vd4rl-pomdp list` shows all of them. Encoders of bc and drq_bc use their own algorithm instead."""
     seed: int = 0
-    """Seed of the networks, the batches and the noise, and of the views unless --view-seed is given. --seeds 0,1,2 in
-    its place trains as many runs as one: OUT/seed0 and so on."""
+    """Seed of the networks, batches and noise, and of the views unless --view-seed is given. --seeds 0,1,2 instead
+    trains several runs in one process, in OUT/seed0, OUT/seed1, ..."""
     updates: int = 500_000
     """Gradient updates."""
     batch_size: int = 256
@@ -43,48 +43,50 @@ class FinetuneConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     views: int = 4
-    """Draws of corruption and shift under which the set is encoded once; 0 encodes every batch anew."""
+    """Number of times the dataset is encoded up front, each with its own draw of corruption and random shift; 0 encodes
+    every batch on the fly."""
     view_seed: int | None = None
-    """Seed of the views: their corruption, shifts and random histories. Runs that share it train on the same features;
-    None: the run's own seed."""
+    """Seed of the views: their corruption, shifts and random histories. Runs with the same view seed train on the same
+    features; None: use --seed."""
     shift: int = 4
-    """Random shift in pixels, one for each episode and view; for each transition with --views 0, for each observation
-    where the encoder is trained."""
+    """Maximum random shift in pixels. Drawn once per episode and view; per transition with --views 0; per observation
+    when the encoder is trained."""
     precision: Precision = "fp32"
-    """Precision of the encoder: fp32, tf32 (on a GPU), or bf16 autocast."""
+    """Encoder precision: fp32, tf32 (GPU only) or bf16 autocast."""
     update_precision: Precision = "fp32"
-    """Precision of the algorithm's matrix products: fp32, tf32 (on a GPU), or, but for last layers, bf16 autocast."""
+    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast, which keeps the last
+    layers in fp32."""
     eval_every: int = 50_000
-    """Updates between two evaluations; the last one is always evaluated."""
+    """Updates between evaluations; the final update is always evaluated."""
     eval_episodes: int = 10
-    """Episodes of an evaluation."""
+    """Episodes per evaluation."""
     eval_clean: bool = True
-    """Play the last evaluation under no corruption, too, which takes as long again; it changes nothing else."""
+    """Also run the final evaluation without corruption. It doubles that evaluation's time and changes nothing else."""
     eval_clean_episodes: int = 0
-    """Episodes of the last evaluation under no corruption; 0: as many as under the corruption."""
+    """Episodes of the uncorrupted final evaluation; 0: same as --eval-episodes."""
     eval_length: int = 500
-    """Most decisions in an evaluation episode, which never has more than the task's; fewer only for trials. The default
-    is all of them, of a task that has more, too."""
+    """Maximum decisions per evaluation episode, capped at the task's episode length. Lower it only for quick tests. The
+    default always means full episodes, even for tasks with more than 500 decisions."""
     workers: int = 0
-    """Processes that evaluate; 0 uses every core."""
+    """Evaluation processes; 0: one per core."""
     device: str = "auto"
     """auto, cpu or cuda."""
     log_every: int = 500
-    """Updates that a row of metrics averages over."""
+    """Updates averaged into one row of metrics."""
     checkpoint_every: int = 5_000
-    """Updates between two checkpoints."""
+    """Updates between checkpoints."""
     wandb: WandbMode = "off"
     """Mirror metrics to wandb: off, offline or online."""
     tensorboard: bool = False
     """Mirror metrics to TensorBoard, in OUT/tensorboard."""
     options: Annotated[Options, tyro.conf.arg(name="algorithm")] = NO_OPTIONS
-    """What the chosen algorithm can be told."""
+    """Options of the chosen algorithm."""
     memory: Annotated[Options, tyro.conf.arg(name="memory")] = NO_OPTIONS
-    """What of an encoder with a memory the policy is given."""
+    """For an encoder with memory: which features the policy gets."""
 
     @property
     def seed_of_views(self) -> int:
-        """What the views are drawn from."""
+        """Seed from which the views are drawn."""
         return self.seed if self.view_seed is None else self.view_seed
 
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
@@ -110,19 +112,19 @@ class FinetuneConfig(StageConfig):
             "checkpoint_every": 20,
         },
     }
-    """`paper` is the full setting, `cpu` the budget that results/ladder chose for two cores, `smoke` shows in seconds
-    that all works."""
+    """`paper` is the full setting; `cpu` the budget chosen in results/ladder for two cores; `smoke` checks in seconds
+    that everything runs."""
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of the algorithm, and of the encoder's memory."""
+        """Options of the algorithm and of the encoder's memory."""
         return {
             "options": ALGORITHMS.named(values["algorithm"]).options.fill(values),
             "memory": HistoryOptions.fill(values),
         }
 
     def check(self) -> None:
-        """Refuse settings that cannot work, before anything is read or written."""
+        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
@@ -132,13 +134,14 @@ class FinetuneConfig(StageConfig):
 
 
 def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, decisions: int) -> FinetuneConfig:
-    """The settings as an encoder's policy is trained with them: what the encoder decides, and only what it reads.
+    """Settings that training actually uses, after the encoder has overridden or disabled some of them.
 
     Args:
-        config: the settings that were told.
-        algorithm: the algorithm that the encoder's method brings along, if it has no frozen stage; else empty.
-        remembers: whether the encoder has a memory.
-        decisions: of an episode of the task; an evaluation of the default length is one of whole episodes.
+        config: the settings as given.
+        algorithm: algorithm that the encoder's method dictates (end-to-end methods such as bc); empty if the
+            encoder is frozen.
+        remembers: whether the encoder has memory.
+        decisions: decisions in one episode of the task; the default `eval_length` is raised to it.
     """
     if config.eval_length == FinetuneConfig.eval_length:
         config = replace(config, eval_length=max(config.eval_length, decisions))

@@ -1,4 +1,4 @@
-"""References without a frozen stage: the encoder is trained by the algorithm's own loss, in V-D4RL's manner.
+"""End-to-end baselines, as in V-D4RL: the encoder is trained by the algorithm's own loss instead of being frozen.
 
 `bc` trains it by behaviour cloning, `drq_bc` by the critic's loss (Lu et al. 2022, arXiv 2206.04779): the actor's
 gradient stops at the representation.
@@ -6,10 +6,9 @@ gradient stops at the representation.
 Authors' code: github.com/conglu1997/v-d4rl (drqbc).
 
 Differences: actor, critic and target critic share the encoder's last layer (Linear, LayerNorm, Tanh). In V-D4RL each
-has one of its own on the convolutions' output: the actor's learns from the actor's loss, and the target critic's is
-averaged like the rest of the target. Here the layer learns from the critic's loss alone, and targets are computed from
-the present one. In `bc`, whose only loss trains it all, nothing of that differs. Initial weights are PyTorch's (theirs:
-orthogonal).
+has its own such trunk on the convolutions: the actor's is trained by the actor's loss, and the target critic's is
+averaged like the rest of the target. Here the layer is trained by the critic's loss only, and targets use its current
+weights. For `bc`, with its single loss, this makes no difference. Initial weights are PyTorch's (theirs: orthogonal).
 """
 
 from __future__ import annotations
@@ -41,16 +40,16 @@ class EndToEnd:
         device = batch.obs.device
         with autocast(device, self.config.precision):
             z = self.encoder.frame(batch.obs).float()
-            with torch.no_grad():  # the target's side; V-D4RL has no slow copy of the encoder either
+            with torch.no_grad():  # targets: V-D4RL has no target encoder either
                 next_z = self.encoder.frame(batch.next_obs).float()
         features = FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z, batch.next_action)
         return self.algorithm.update(features, self.optimiser)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on."""
+        """Everything needed to resume."""
         return {name: getattr(self, name).state_dict() for name in ("algorithm", "encoder", "optimiser")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Resume from `state_dict`."""
         for name, own in state.items():
             getattr(self, name).load_state_dict(own)

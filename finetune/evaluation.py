@@ -1,4 +1,4 @@
-"""Evaluate a frozen encoder and a policy in the corrupted environment, episodes in parallel, raw rows as the result."""
+"""Evaluate a frozen encoder and a policy in the corrupted environment: parallel episodes, raw rows as the result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vd4rl_pomdp.runs.results import Result, read_run
 from vd4rl_pomdp.runs.workers import run_jobs
 
 FILM_EVERY = 4
-"""Rows between two pictures of a film."""
+"""Rows between two frames of a film."""
 
 
 @dataclass(frozen=True)
@@ -41,50 +41,50 @@ class EpisodeJob:
     encoder: Path
     policy: Path
     task: Task
-    """Itself and not its name: a task of one's own need not be registered where the job is done."""
+    """The task itself, not its name: a user's task need not be registered in the worker process."""
     corruption: CorruptionConfig
     episode: int
     film: bool
     length: int | None = None
     actor: Path | None = None
-    """File of the actor that made the data; None: it is not known."""
+    """File of the behaviour policy that collected the data; None if unknown."""
     evaluated_under: str = ""
-    """What its rows say of the corruption; empty for its name."""
+    """Label of the corruption in the rows; empty: the corruption's name."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What an evaluation episode gave."""
+    """Result of an evaluation episode."""
 
     evaluated_under: str
-    """The corruption that it was played under: its name, and the options in which it is not the run's own."""
+    """Corruption during the episode: its name, plus any options that differ from the run's own."""
     episode: int
     rewards: list[float]
-    """One a decision."""
+    """One per decision."""
     film: dict[str, np.ndarray] | None
-    """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 pictures, `return` (F,) so far."""
+    """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 frames, and `return` (F,) so far."""
     action_errors: list[np.floating] = field(default_factory=list)
-    """In closed loop, one a decision: mean squared difference between the policy's action and the mean action of the
-    data's actor at the state it is in; empty: the actor is not known."""
+    """Per decision, in closed loop: mean squared difference between the policy's action and the behaviour policy's mean
+    action in the current state; empty if that policy is unknown."""
 
     @property
     def total(self) -> float:
-        """Its return, added up in order."""
-        return float(np.cumsum(self.rewards)[-1])  # np.sum adds in pairs: other last digits
+        """Undiscounted return, summed in order."""
+        return float(np.cumsum(self.rewards)[-1])  # np.sum is pairwise: other last digits
 
     @property
     def action_error(self) -> float | None:
-        """Mean over its decisions, None if they are unknown."""
+        """Mean over its decisions; None if unknown."""
         return float(np.mean(self.action_errors)) if self.action_errors else None
 
 
 def evaluate(jobs: list[EpisodeJob], workers: int) -> list[Episode]:
-    """Run evaluation episodes; their results do not depend on `workers`."""
+    """Run evaluation episodes. Results do not depend on `workers`."""
     return list(run_jobs(_run_episode, jobs, workers))
 
 
 def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`: those of the training."""
+    """Rows of `episodes.csv`, one per episode; `labels` gives the columns up to `step`, as in training."""
     divisor = TASKS.named(labels["task"]).score_divisor
     return [
         labels
@@ -103,7 +103,7 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
 
 @cache
 def _environment(*place: Any) -> CorruptedEnv:
-    """The process's environment for these arguments: one GL context serves all its episodes."""
+    """Cached environment of this process, so that all episodes share one GL context."""
     return CorruptedEnv(*place)
 
 
@@ -112,14 +112,14 @@ _read_actor = cache(read_actor)
 
 @lru_cache(maxsize=1)
 def _agent(encoder: Path, policy: Path, written: tuple[int, ...]) -> Agent:
-    """The agent of two folders, read anew when another is asked for or one was `written` again."""
+    """The agent of two folders, cached until another is requested or one of its folders was `written` again."""
     return Agent(load_encoder(encoder)[0], load_policy(policy))
 
 
 def _run_episode(job: EpisodeJob) -> Episode:
     written = tuple(folder.stat().st_mtime_ns for folder in (job.encoder, job.policy) if folder.exists())
     agent = _agent(job.encoder, job.policy, written)
-    # a film shows all frames; else no frame is drawn that its agent does not see
+    # a film needs all frames; otherwise render only frames that the agent sees
     draws: Drawn = "all" if job.film else "nothing" if agent.encoder.reads_state else "seen"
     env = _environment(job.task, job.corruption, "fast", job.length, agent.picture_size, draws)
     agent.reset()
@@ -147,14 +147,14 @@ def _run_episode(job: EpisodeJob) -> Episode:
 
 
 def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | None]]:
-    """Where in time policies lose their way.
+    """Mean reward and action error by time within the episode, to see where policies fail.
 
     Args:
-        episodes: some that share a task; one that ended early is in the parts that it reached.
-        parts: into how many the longest is cut, at least 1; more than it has decisions are as many as these.
+        episodes: of one task; one that ended early counts in the parts that it reached.
+        parts: number of equal parts of the longest episode, at least 1; capped at its number of decisions.
 
     Returns:
-        By first and last decision ("0-49"): mean `reward` and `action_error` (None: unknown) of a decision.
+        By first and last decision ("0-49"): mean `reward` and `action_error` (None if unknown) per decision.
     """
     longest = max(len(episode.rewards) for episode in episodes)
     parts = min(parts, longest)
@@ -168,7 +168,7 @@ def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | 
 
 
 def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:
-    """The corruptions that a policy trained under one is evaluated under: that one, and none at all."""
+    """Corruptions for evaluating a policy: the one of its training, and none."""
     clean = CorruptionConfig.of("none")
     return [corruption] if corruption.corruption == clean.corruption else [corruption, clean]
 
@@ -182,7 +182,7 @@ def jobs_of(
     film: bool = False,
     evaluated_under: str = "",
 ) -> list[EpisodeJob]:
-    """The episodes of an evaluation of a run's policy, under each corruption in turn; a film is of the very first."""
+    """Evaluation episodes of a run's policy under each corruption in turn. Only the very first is filmed."""
     actor = Reference.read(run).actor_file
     length = min(length, task.decisions)
     return [
@@ -196,15 +196,15 @@ def jobs_of(
 
 
 def another(trained: dict[str, Any], corruption: str, options: dict[str, Any]) -> tuple[CorruptionConfig, str]:
-    """A corruption to evaluate under, and what rows say of it.
+    """Another corruption to evaluate under, and its label in rows.
 
     Args:
-        trained: settings of the corruption that a policy was trained under.
-        corruption: name of the other.
-        options: its options by name; those that are not here are as in training, or the defaults.
+        trained: settings of the policy's training corruption.
+        corruption: name of the other one.
+        options: its options by name; missing ones are as in training, or else the defaults.
 
     Returns:
-        The corruption, and its name with the given options that differ: "patch, patch_size 24".
+        The corruption, and its name with the options that differ from training: "patch, patch_size 24".
     """
     own = CorruptionConfig.fill(trained | {"corruption": corruption})
     before = flat(own)
@@ -215,7 +215,7 @@ def another(trained: dict[str, Any], corruption: str, options: dict[str, Any]) -
 
 
 def refuse_kept(run: Path, evaluated_under: str) -> None:
-    """Raise UserError where rows under a corruption cannot be added to those of a run: it goes on, or has some."""
+    """Raise UserError if rows cannot be added to a run: it is unfinished, or has rows under that corruption already."""
     if not (run / TIMING_FILE).exists():
         raise UserError(f"{run}: has not finished, and writes {EPISODES_FILE} itself; leave --keep out until then")
     step = policy_step(run / "policy")
@@ -231,19 +231,18 @@ def evaluate_run(
 
     Args:
         run: its folder.
-        corruption: name of the corruption to evaluate under, with the run's own options where it reads them; None for
-            the run's own, and for none at all, too.
-        episodes: how many under each corruption, as long as those of the run's own evaluations.
-        workers: processes, 0 for every core.
-        options: values of that corruption's options that need not be the run's own; the rows' `evaluated_under` tells
-            of those that are not.
+        corruption: name of the corruption to evaluate under, with the run's options where they apply. None: both
+            the run's own corruption and no corruption.
+        episodes: episodes per corruption, as long as in the run's own evaluations.
+        workers: processes; 0: one per core.
+        options: overrides of that corruption's options; the rows' `evaluated_under` names those that differ from
+            the run's.
 
     Returns:
         Rows of `episodes.csv` (`corruption` is that of training, `step` that of the policy), and their episodes.
 
     Raises:
-        UserError: an unknown corruption or option, one that does not fit, no episode, or a folder without an evaluated
-            run.
+        UserError: an unknown or unsuitable corruption or option, no episodes, or a folder without an evaluated run.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
@@ -267,21 +266,21 @@ def evaluate_run(
 
 
 REPLAYED = ("return", "length", "score", "action_error")
-"""Columns of `episodes.csv` that a replay gives again."""
+"""Columns of `episodes.csv` that a replay recomputes."""
 
 
 def replay(run: Path, results: Iterable[Result]) -> tuple[Row, Row, str]:
-    """Play the first episode of a run's last evaluation again.
+    """Replay the first episode of a run's last evaluation.
 
     Args:
         run: the run's folder, with encoder and policy.
-        results: among which its row is looked for, by its id.
+        results: results among which the run's row is looked up by id.
 
     Returns:
-        The row that tells of the episode, what it gives here, and what drew and computed both, in words.
+        The recorded row, the replayed row, and a text on the renderers and processors behind both.
 
     Raises:
-        UserError: as `evaluate_run`, or none of the results tells of this run, or of its policy's last evaluation.
+        UserError: as in `evaluate_run`, or the results lack this run or its policy's last evaluation.
     """
     own, step = read_run(run), policy_step(run / "policy")
     told = next((result for result in results if result.id == own.id), None)

@@ -1,4 +1,4 @@
-"""From a finished fine-tuning to an agent's folder (`vd4rl_pomdp.agents`), its episodes played as it was rounded."""
+"""Export a finished fine-tuning as an agent's folder (`vd4rl_pomdp.agents`), re-evaluated after rounding to float16."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ KEPT = ("episode", "episode_seed", "return", "length", "score", "evaluated_under
 
 
 def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> Row:
-    """Round a run's encoder and policy to half precision, play them, and write both and the card as an agent's folder.
+    """Round a run's encoder and policy to half precision, evaluate them, and write both and a card into an agent's
+    folder.
 
-    Args:
-        run: folder of a finished fine-tuning.
-        out: folder to make; an empty one will do.
-        episodes: how many to play, under the corruption of training and under none.
-        workers: processes, 0 for every core.
+        Args:
+            run: folder of a finished fine-tuning.
+            out: folder to create; may exist if empty.
+            episodes: evaluation episodes, each under the training corruption and under none.
+            workers: processes; 0: one per core.
 
-    Raises:
-        UserError: `run` is no finished fine-tuning or is damaged, or `out` holds something.
+        Raises:
+            UserError: `run` is no finished fine-tuning or is damaged, or `out` is not empty.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
@@ -66,24 +67,25 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
 
 
 def replay_agent(folder: Path) -> Row:
-    """What the first episode of an agent's card gives here."""
+    """Replay the first episode of an agent's card; returns its row."""
     card = read_json(folder / CARD)
     return _played(folder, card, card["length"], [CorruptionConfig.fill(card["corruption"])], 1, 1)[0]
 
 
 def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple[list[Row], list[list[Episode]]]:
-    """The same episodes by several agents of a task, under the corruption of the first; the first one is filmed.
+    """Play the same episodes with several agents of a task, under the first agent's corruption. First episodes are
+    filmed.
 
-    Args:
-        names: agents that ship, or folders.
-        episodes: how many each plays.
-        workers: processes, 0 for every core.
+        Args:
+            names: shipped agents, or folders.
+            episodes: episodes per agent.
+            workers: processes; 0: one per core.
 
-    Returns:
-        The agents' cards, and their episodes.
+        Returns:
+            The agents' cards, and their episodes.
 
-    Raises:
-        UserError: an agent is unknown or damaged, or their tasks differ.
+        Raises:
+            UserError: an agent is unknown or damaged, or the agents' tasks differ.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
@@ -102,6 +104,6 @@ def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple
 def _played(
     folder: Path, labels: Row, length: int, under: list[CorruptionConfig], episodes: int, workers: int
 ) -> list[Row]:
-    """Rows of a card: so many episodes under each corruption in turn."""
+    """A card's rows: the given number of episodes under each corruption in turn."""
     jobs = jobs_of(folder, TASKS.named(labels["task"]), under, episodes, length)
     return [{name: row[name] for name in KEPT} for row in episode_rows(evaluate(jobs, workers), labels)]

@@ -1,6 +1,6 @@
-"""Frozen means cacheable: encode the set once under several draws of corruption and shift, train on the features.
+"""Cache the frozen encoder's features: encode the dataset once under several draws of corruption and shift.
 
-With `--views 0` every batch is encoded anew instead.
+With `--views 0` every batch is encoded on the fly instead.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from vd4rl_pomdp.runs.files import content_hash, replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 CHUNK, GPU_CHUNK = 128, 1024
-"""Rows that go through the frame encoder at once, on a CPU and on a GPU."""
+"""Batch size of the frame encoder, in rows, on a CPU and on a GPU."""
 GPU_GROUP = 4096
-"""Rows of consecutive episodes that a memory reads at once on a GPU; on a CPU it reads one episode after the other."""
+"""Rows of consecutive episodes that a memory processes at once on a GPU; on a CPU it processes one episode at a
+time."""
 STAGE = "finetune"
 
 
@@ -51,11 +52,11 @@ class FeatureBatch(Batch):
     next_z: Tensor
     """(B, D)."""
     next_action: Tensor
-    """(B, A): the set's action at next_z; zero at an episode's last row, which has none."""
+    """(B, A): the dataset's action at next_z; zero at an episode's last row, which has none."""
 
 
 class FrozenEncoder:
-    """A frozen encoder with the corruption and shift under which it sees a data set."""
+    """A frozen encoder, with the corruption and shift under which it sees a dataset."""
 
     def __init__(
         self,
@@ -70,12 +71,12 @@ class FrozenEncoder:
         self._shift, self._seed = shift, seed
         self.device = dataset.t.device
         self._corruption = corruption
-        # on a CPU another batch gives other last digits: there it stays what it was
+        # CPU results depend on the batch size in their last digits, so keep the original one there
         self.chunk, self.group = (CHUNK, 1) if self.device.type == "cpu" else (GPU_CHUNK, GPU_GROUP)
 
     def view(self, number: int) -> View:
-        """One draw of corruption and shift; under `emission` all are corrupted alike."""
-        # from the run's own seed: the spread over seeds then holds that of what was hidden, too
+        """One draw of corruption and shift. `emission` corruptions are the same in every view."""
+        # seeded by the run, so the spread over seeds includes that of the corruption
         if isinstance(self.encoder.frame, StateFrame):
             return StateView(self.dataset, self.encoder.frame.observe, self._corruption, self._seed, STAGE, number)
         return View(self.dataset, self._corruption, self._shift, self._seed, STAGE, number)
@@ -97,14 +98,14 @@ class FrozenEncoder:
         return read_whole(self.encoder, self.frames(one, view), self.dataset, one)
 
     def frames(self, episodes: range, view: View) -> Tensor:
-        """Frame features (rows, F) of consecutive whole episodes; one shift for all of an episode."""
+        """Frame features (rows, F) of consecutive whole episodes, with one shift per episode."""
         whole = self.dataset.rows_of(episodes)
         rows = torch.arange(whole.start, whole.stop, device=self.device)
-        # a memory would take shifts that change from row to row for motion
+        # a memory would mistake shifts that change within an episode for motion
         return self.rows(rows, derive_keys(view.shifts.seed, self.dataset.episode[rows]), view)
 
     def groups(self) -> Iterator[range]:
-        """All episodes in order, so many at a time that they fill no more than `group` rows, each as the longest."""
+        """All episodes in order, grouped so that each group padded to its longest episode has at most `group` rows."""
         lengths = (self.dataset.episode_end - self.dataset.episode_start).tolist()
         first, longest = 0, 0
         for number, length in enumerate(lengths):
@@ -115,29 +116,30 @@ class FrozenEncoder:
         yield range(first, len(lengths))
 
     def name(self, encoder: str) -> str:
-        """What decides what every view of the set looks like to the encoder of this name: equal for equal features."""
+        """Cache key of all features of the dataset under this encoder: equal for equal features."""
         network = [encoder, asdict(self.encoder.config), self.precision]
         drawn = [self.dataset.fingerprint, flat(self._corruption), self._shift, self._seed]
         return content_hash([network, drawn, str(self.device), self.chunk, self.group])
 
 
 _ENCODED: WeakValueDictionary[tuple[str, str, int], Tensor] = WeakValueDictionary()
-"""Features that a training of this process still uses, by all that decides them."""
+"""Features still in use by a training in this process, by everything that determines them."""
 
 
 def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path, encoder: str) -> Tensor:
-    """Encode the whole set under `views` draws, unless a training of this process did, or this run before.
+    """Encode the whole dataset under `views` draws, or reuse the features from this process or from this run's file.
 
     Args:
-        frozen: the encoder and its set.
+        frozen: the encoder and its dataset.
         histories: which features there are.
-        views: how many draws of corruption and shift.
-        kept: file that keeps the features for the run's resumption; the run refuses another set or encoder itself.
-        encoder: the encoder's name, which tells its weights from all others (`encoder_hash`).
+        views: number of draws of corruption and shift.
+        kept: file that keeps the features for resuming; the run itself checks that dataset and encoder are
+            unchanged.
+        encoder: hash of the encoder's weights (`encoder_hash`).
 
     Returns:
-        (views, features, D) on the data set's device, float16 of pixels and float32 of simulator states, which may
-        hardly differ and are then scaled up; numbered as `Histories` says. Not to be written to: trainings on the same
+        (views, features, D) on the dataset's device; numbered as in `Histories`. float16 for pixels; float32 for
+        simulator states, which may differ very little before they are scaled up. Read-only: trainings on the same
         features share them.
     """
     key = frozen.name(encoder), histories.name(), views
@@ -157,7 +159,7 @@ def _encode(frozen: FrozenEncoder, histories: Histories, views: int) -> Tensor:
     dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
     features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
     total = views * frozen.dataset.num_episodes
-    # without gradients nothing is compiled on a GPU, which takes longer than encoding does
+    # on a GPU, no_grad avoids compiling, which takes longer than the encoding
     with torch.no_grad(), ProgressLine("encode", total, "episodes") as progress:
         for number in range(views):
             view, random = frozen.view(number), histories.of_view(number)
@@ -168,7 +170,7 @@ def _encode(frozen: FrozenEncoder, histories: Histories, views: int) -> Tensor:
 
 
 class FeatureSampler:
-    """Uniform n-step transitions of cached features; a transition's two ends come from the same view."""
+    """Uniform n-step transitions of cached features. Both ends of a transition come from the same view."""
 
     def __init__(
         self, histories: Histories, features: Tensor, batch_size: int, n_step: int, gamma: float,
@@ -179,19 +181,19 @@ class FeatureSampler:
         reward, discount, _ = dataset.n_step_returns(rows, n_step, gamma)
         actions = dataset.action_after(rows), dataset.action_or_zero(histories.ends)
         self.told = torch.cat([*actions, reward[:, None], discount[:, None]], dim=1)
-        """(M, 2 A + 2): actions at both ends, reward and discount of every transition. Few tensors: a GPU is asked for
-        each apart."""
-        # z and z' are both read from the cache, for the critics' target, too: the encoder never changes
+        """(M, 2 A + 2): actions at both ends, reward and discount of every transition, in one tensor to save GPU kernel
+        launches."""
+        # the critics' targets can use cached z' because the encoder never changes
         ends = [torch.stack(histories.of_view(view).numbers()) for view in range(len(features))]
         self.ends = torch.stack([number + view * features.shape[1] for view, number in enumerate(ends)], dim=1)
-        """(2, views, M) int64: where both ends of every transition are in each view, views one behind the other."""
+        """(2, views, M) int64: index of both ends of every transition in each view, with views concatenated."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on with the same batches."""
+        """Everything needed to resume with the same batches."""
         return {"batches": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Resume from `state_dict`."""
         self.draws.set_state(state["batches"])
 
     def sample(self) -> FeatureBatch:
@@ -204,10 +206,10 @@ class FeatureSampler:
 
 
 class StackedSampler:
-    """Batches of several runs that are trained as one, each run's own (`finetune.stack`)."""
+    """Batches of several runs trained as a stack, each run's own (`finetune.stack`)."""
 
     def __init__(self, samplers: Sequence[FeatureSampler]) -> None:
-        """Begin where the runs' samplers, of as many views and transitions in a batch, stand; they stay there."""
+        """Start from copies of the runs' samplers, which must agree in views and batch size."""
         self._features = [sampler.features.flatten(0, 1) for sampler in samplers]
         self._shared = all(sampler.features is samplers[0].features for sampler in samplers)
         self._counts, self._views = [len(sampler.told) for sampler in samplers], len(samplers[0].features)
@@ -231,14 +233,14 @@ class StackedSampler:
 
 
 def _batch(both: Tensor, told: Tensor) -> FeatureBatch:
-    """A batch of (2, ..., D) features of both ends, and (..., 2 A + 2) of what else is known."""
+    """Build a batch from (2, ..., D) features of both ends and (..., 2 A + 2) actions, rewards and discounts."""
     z, next_z = both.float()
     action, next_action = told[..., :-2].chunk(2, dim=-1)
     return FeatureBatch(z, action, told[..., -2], told[..., -1], next_z, next_action)
 
 
 class ExactSampler(Sampler):
-    """Uniform n-step transitions whose representations are computed anew for every batch."""
+    """Uniform n-step transitions whose representations are computed on the fly."""
 
     def __init__(
         self, frozen: FrozenEncoder, options: Options, batch_size: int, n_step: int, gamma: float,
@@ -250,7 +252,7 @@ class ExactSampler(Sampler):
         self._starts = frozen.dataset.transition_rows
 
     def sample(self) -> FeatureBatch:
-        """The next batch; an encoder with a memory reads every row of a transition's history, or of its window."""
+        """The next batch. An encoder with memory reads all rows of a transition's history or window."""
         dataset = self._frozen.dataset
         rows = self._starts[self._draw(len(self._starts))]
         reward, discount, next_rows = dataset.n_step_returns(rows, self._n_step, self._gamma)
@@ -261,14 +263,14 @@ class ExactSampler(Sampler):
     @torch.no_grad()
     def _encode(self, rows: Tensor, next_rows: Tensor) -> tuple[Tensor, Tensor]:
         encoder = self._frozen.encoder
-        # one shift for all rows of a transition, as in a view: none within an episode of the environment either
+        # one shift per transition, as in a view, where an episode has one shift
         key = self.view.shifts.take((len(rows),), rows.device)
         if not encoder.remembers:
             features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self.view)
             return features[: len(rows)], features[len(rows) :]
 
         def frames(rows: Tensor) -> Tensor:
-            """Frame features (B, T, F) of (B, T) rows, those under one leading index shifted alike."""
+            """Frame features (B, T, F) of (B, T) rows, with one shift per leading index."""
             keys = key.repeat_interleave(rows.shape[1])
             return self._frozen.rows(rows.reshape(-1), keys, self.view).view(*rows.shape, -1)
 

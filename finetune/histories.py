@@ -1,9 +1,9 @@
-"""What the policy is given of an encoder with a memory: which of its outputs, and where the histories begin.
+"""For encoders with memory: which of its outputs the policy gets, and where histories begin.
 
-A policy is trained on the states of the data's histories, and meets its own. Where all of the data's are whole
-episodes of one behaviour, a state also tells how the episode went so far, which a policy can lean on and which is
-different as soon as it acts (Swamy et al. 2022, arXiv 2208.02225). Histories of part of the transitions can therefore
-begin at random rows instead: both ends of such a transition are then read from the same beginning.
+A policy is trained on the memory states of the data's histories, but acts on its own. If all histories are whole
+episodes of one behaviour policy, the state also reveals how the episode has gone so far. A policy can exploit this, and
+fails once it acts and its own history differs (Swamy et al. 2022, arXiv 2208.02225). So a fraction of the histories can
+start at random rows instead; both ends of such a transition are read from the same start.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from vd4rl_pomdp.runs.files import content_hash
 
 @dataclass(frozen=True)
 class HistoryOptions(Options):
-    """Options for encoders with a memory; those without refuse them."""
+    """Options for encoders with memory; encoders without memory reject them."""
 
     readout: Readout = "state"
-    """What the policy is given: state (s_t), frame (e(o_t) alone) or frame+state (both)."""
+    """Input of the policy: state (s_t), frame (e(o_t) only) or frame+state (both)."""
     history_window: int = 0
-    """Rows that a state is computed from, in training and in evaluation; 0: as the encoder's own config has it."""
+    """Rows from which a state is computed, in training and evaluation; 0: as in the encoder's own config."""
     random_histories: float = 0.0
-    """Share of the transitions whose history begins at a random row, and not with the episode."""
+    """Fraction of transitions whose history begins at a random row instead of the episode's start."""
     shortest_history: int = 2
-    """Least rows of a history that begins at a random row; fewer where the episode begins sooner."""
+    """Minimum rows of a random history; fewer if the episode starts within them."""
     longest_history: int = 8
-    """Most rows of a history that begins at a random row."""
+    """Maximum rows of a random history."""
 
     limits: ClassVar[Limits] = {
         "history_window": 0,
@@ -46,7 +46,7 @@ class HistoryOptions(Options):
     }
 
     def check(self) -> None:
-        """Raise UserError for values that cannot work."""
+        """Raise UserError for invalid values."""
         super().check()
         if self.shortest_history > self.longest_history:
             raise UserError(
@@ -56,25 +56,25 @@ class HistoryOptions(Options):
 
     @property
     def encoder_changes(self) -> dict[str, Any]:
-        """What they change about an encoder's config, also where it is evaluated."""
+        """Changes to the encoder's config, also for evaluation."""
         window = {"history_window": self.history_window} if self.history_window else {}
         return {"readout": self.readout} | window
 
 
 class Histories:
-    """Transitions of a set, and which of them, in every view, have a history that begins at a random row.
+    """A dataset's transitions, and which of them have a random history in each view.
 
-    The features of a view are numbered: first those of the set's N rows, each with its whole history; then the first
-    ends, then the last ends, of the R transitions with a random history.
+    Features of a view are numbered: first the dataset's N rows with full histories, then the first ends, then the
+    last ends, of the R transitions with a random history.
     """
 
     def __init__(self, dataset: Dataset, options: Options, n_step: int, seed: int) -> None:
         """See the class.
 
         Args:
-            dataset: the set.
-            options: `HistoryOptions`; others mean whole histories.
-            n_step: rows from one end of a transition to the other; fewer at an episode's end.
+            dataset: the dataset.
+            options: `HistoryOptions`; any other options mean full histories.
+            n_step: rows between both ends of a transition; fewer at an episode's end.
             seed: the run's seed.
         """
         self.dataset, self._n_step, self._seed = dataset, n_step, seed
@@ -84,16 +84,16 @@ class Histories:
         self.ends = dataset.successors(self.rows, n_step)
         """(M,) int64: last end of every transition."""
         self.random = round(self._options.random_histories * len(self.rows))
-        """R."""
+        """R, the number of random histories."""
         self.features = dataset.num_rows + 2 * self.random
-        """Features of a view."""
+        """Features per view."""
 
     def name(self) -> str:
-        """What decides which features of a view there are: equal for equal ones."""
+        """Cache key of a view's set of features: equal for equal ones."""
         return content_hash([asdict(self._options), self._n_step, self._seed]) if self.random else ""
 
     def of_view(self, view: int) -> RandomHistories:
-        """What is drawn for a view."""
+        """Draw the random histories of a view."""
         generator = stream_generator(self._seed, "finetune", "histories", view)
         chosen = torch.randperm(len(self.rows), generator=generator)[: self.random].sort().values
         shortest, longest = self._options.shortest_history, self._options.longest_history
@@ -103,16 +103,16 @@ class Histories:
 
 @dataclass(frozen=True)
 class RandomHistories:
-    """The random histories of one view."""
+    """Random histories of one view."""
 
     histories: Histories
     chosen: Tensor
-    """(R,) int64, in order: the transitions that have one."""
+    """(R,) int64, sorted: transitions with a random history."""
     length: Tensor
-    """(R,) int64: its rows up to the transition's first end."""
+    """(R,) int64: rows of the history up to the transition's first end."""
 
     def numbers(self) -> tuple[Tensor, Tensor]:
-        """Numbers of the features of both ends of every transition: (M,) and (M,) int64."""
+        """Feature numbers of both ends of every transition: (M,) and (M,) int64."""
         first, last = self.histories.rows.clone(), self.histories.ends.clone()
         fresh = self.histories.dataset.num_rows + torch.arange(len(self.chosen), device=first.device)
         first[self.chosen], last[self.chosen] = fresh, fresh + len(self.chosen)
@@ -122,8 +122,8 @@ class RandomHistories:
         """Write the features of consecutive episodes into a view's.
 
         Args:
-            out: (features, D), numbered as `Histories` says.
-            encoder: with a memory, if any history is random.
+            out: (features, D), numbered as in `Histories`.
+            encoder: must have memory if any history is random.
             frames: (rows, F) frame features of the episodes' rows.
             episodes: their numbers.
         """
@@ -134,7 +134,7 @@ class RandomHistories:
         mine = torch.nonzero((row >= whole.start) & (row < whole.stop))[:, 0]
         if len(mine):
             row, last = row[mine], self.histories.ends[self.chosen[mine]]
-            # both ends from one beginning: else z' would remember rows that z does not
+            # same start for both ends, or z' would remember rows that z does not
             first = torch.maximum(row - self.length[mine] + 1, dataset.episode_start[dataset.episode[row]])
             z, next_z = read_both_ends(encoder, lambda rows: frames[rows - whole.start], dataset, first, row, last)
             number = (dataset.num_rows + mine).to(out.device)
@@ -142,12 +142,12 @@ class RandomHistories:
 
 
 def read_whole(encoder: Encoder, frames: Tensor, dataset: Dataset, episodes: range) -> Tensor:
-    """Representations (rows, D) of consecutive episodes from their first rows on, given their (rows, F) features."""
+    """Representations (rows, D) of consecutive episodes with full histories, from their (rows, F) frame features."""
     if not encoder.remembers:
         return frames
     first, end = (ends[episodes.start : episodes.stop, None] for ends in (dataset.episode_start, dataset.episode_end))
     span = torch.arange(int((end - first).max()), device=frames.device)
-    # shorter episodes repeat their last row behind it, which a forward memory cannot know of
+    # pad shorter episodes with their last row; a causal memory cannot look ahead to the padding
     rows = torch.minimum(first + span, end - 1)
     states = encoder.from_features(frames[rows - rows[0, 0]], dataset.actions_before(rows))
     return states[first + span < end]
@@ -159,13 +159,13 @@ def read_both_ends(
     """Representations (B, D) and (B, D) of rows `row` and `last`, with histories that begin at rows `first`.
 
     Args:
-        encoder: with a memory.
+        encoder: must have memory.
         frames: frame features (B, T, F) of (B, T) int64 rows.
-        dataset: the set.
-        first, row, last: (B,) int64, of one episode each, first <= row <= last.
+        dataset: the dataset.
+        first, row, last: (B,) int64, each triple from one episode, first <= row <= last.
     """
     span = torch.arange(int((last - first).max()) + 1, device=row.device)
-    # shorter histories repeat their last row behind what is picked, which a forward memory cannot know of
+    # pad shorter histories with their last row; a causal memory cannot look ahead to the padding
     history = torch.minimum(first[:, None] + span, last[:, None])
     states = encoder.from_features(frames(history), dataset.actions_before(history))
     pick = torch.arange(len(row), device=row.device)

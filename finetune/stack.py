@@ -1,7 +1,7 @@
-"""Several runs trained as one: their networks share tensors with a leading dimension, and an update moves them all.
+"""Train several runs at once: their networks share tensors with a leading run dimension, updated together.
 
-Each run stays an algorithm of its own, whose tensors are slices of the shared ones: it is evaluated and saved, and goes
-on, as if it were trained alone. What is computed is what each run computes, up to the order of summation.
+Each run remains a separate algorithm whose tensors are slices of the shared ones, and is evaluated, saved and resumed
+as if trained alone. Results equal those of separate runs up to floating-point summation order.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from vd4rl_pomdp.nn.policy import Policy
 
 
 class Stack:
-    """Algorithms of S runs, S at least 2, of one kind and with the same options, sizes and number of updates made."""
+    """Algorithms of S >= 2 runs of the same kind, options, sizes and number of updates done."""
 
     def __init__(self, runs: Sequence[Algorithm]) -> None:
-        """Take over the runs' state; their networks are the stack's from now on, the rest of it again with `settle`."""
+        """Take over the runs' state. Their networks become slices of the stack's; `settle` writes back everything
+        else."""
         first = runs[0]
         device = first.policy.standardise.mean.device
-        with fork_rng(devices=[]):  # these weights are those of nobody
+        with fork_rng(devices=[]):  # these initial weights are overwritten; keep the global RNG state
             policy = Policy(**first.policy.shape).to(device)
             draws = stacked([run.draws for run in runs])
             whole = type(first)(policy, first.settings, first.learning_rate, first.planned, draws)
@@ -44,9 +45,9 @@ class Stack:
         for part, own in self._parts:
             if isinstance(part, nn.Module):
                 for tensor, *slices in zip(_tensors(part), *map(_tensors, own), strict=True):
-                    if id(tensor) not in shared:  # a part may be in another
+                    if id(tensor) not in shared:  # one part may contain another
                         shared.add(id(tensor))
-                        # in place of what they hold, so that optimisers hold them still
+                        # in place, so that optimisers keep their references
                         tensor.data = torch.stack([each.data for each in slices])
                         for run, each in enumerate(slices):
                             each.data = tensor.data[run]
@@ -58,11 +59,11 @@ class Stack:
         whole.each = self._each  # type: ignore[method-assign]
 
     def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
-        """An update of every run, on a batch whose tensors are (S, B, ...); (S,) logs."""
+        """One update of every run, on a batch of (S, B, ...) tensors; returns (S,) logs."""
         return self.whole.update(batch)
 
     def settle(self, number: int) -> None:
-        """Tell a run how far it is: updates, random numbers, and its slice of the optimisers' state."""
+        """Write a run's progress back: updates, random state, and its slice of the optimisers' state."""
         run = self.runs[number]
         run.updates = int(self.whole.updates)
         run.draws.set_state(self.whole.draws.get_state(number))
@@ -71,7 +72,7 @@ class Stack:
                 _slice_optimiser(part, own[number], number)
 
     def _each(self, function: Callable[..., Result], batch: FeatureBatch, *tensors: Tensor) -> Result:
-        """What a function says of each run's batch, under each run's weights."""
+        """Apply a function to each run's batch under each run's weights."""
 
         def one(own: dict[str, Tensor], fields: dict[str, Tensor], *more: Tensor) -> Any:
             return functional_call(self._modules, own, (function, FeatureBatch(**fields), *more))
@@ -89,7 +90,7 @@ class Stack:
 
 
 class _Modules(nn.Module):
-    """Modules as one, to run a function while they hold other tensors."""
+    """Wraps modules, to call a function while they hold other tensors (`functional_call`)."""
 
     def __init__(self, modules: Sequence[nn.Module]) -> None:
         super().__init__()
@@ -108,12 +109,12 @@ def _parameters(optimiser: Optimizer) -> list[nn.Parameter]:
 
 
 def _follows(name: str, value: Any, parameter: Tensor) -> bool:
-    """Whether an entry of an optimiser's state has a number for each of the parameter's; else it counts steps."""
+    """Whether an entry of an optimiser's state is per parameter element (e.g. moments), not a step counter."""
     return isinstance(value, Tensor) and name != "step" and value.shape == parameter.shape
 
 
 def _stack_optimiser(whole: Optimizer, runs: Sequence[Optimizer]) -> None:
-    """Give an optimiser of stacked parameters the state of those of the runs."""
+    """Set an optimiser of stacked parameters to the state of the runs' optimisers."""
     for group, first in zip(whole.param_groups, runs[0].param_groups, strict=True):
         group.update({name: _copy(value) for name, value in first.items() if name != "params"})
     for parameter, *own in zip(_parameters(whole), *map(_parameters, runs), strict=True):
@@ -124,7 +125,7 @@ def _stack_optimiser(whole: Optimizer, runs: Sequence[Optimizer]) -> None:
 
 
 def _slice_optimiser(whole: Optimizer, run: Optimizer, number: int) -> None:
-    """Give a run's optimiser its slice of the state."""
+    """Set a run's optimiser to its slice of the state."""
     for group, its in zip(whole.param_groups, run.param_groups, strict=True):
         its.update({name: _copy(value) for name, value in group.items() if name != "params"})
     for parameter, own in zip(_parameters(whole), _parameters(run), strict=True):
@@ -137,9 +138,9 @@ def _copy(value: Any) -> Any:
 
 
 class _BatchedLinears(TorchFunctionMode):
-    """Within `vmap`: linear layers as one product each, weights first.
+    """Within `vmap`, computes linear layers as one product each, weights first.
 
-    PyTorch's own rule multiplies and adds the bias apart, and gives gradients of transposed weights, which are copied.
+    PyTorch's own rule adds the bias separately, and yields gradients of transposed weights, which need a copy.
     """
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -153,7 +154,7 @@ def _linear(input: Tensor, weight: Tensor, bias: Tensor | None = None) -> Any:
 
 
 class _Linear(torch.autograd.Function):
-    """`F.linear` of each run: the rule below is made of PyTorch's operators, which know their gradients."""
+    """`F.linear` per run, with a vmap rule made of differentiable PyTorch operators."""
 
     @staticmethod
     def forward(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:

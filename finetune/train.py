@@ -1,4 +1,4 @@
-"""`vd4rl-pomdp finetune`: one run or several at once, each with a trainer of its own (`finetune.trainer`)."""
+"""`vd4rl-pomdp finetune`: trains one run, or several at once, each with its own `finetune.trainer`."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from vd4rl_pomdp.runs.workers import kept_workers
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
-    """Run the stage, or resume it; writes the policy and `episodes.csv` into the run's folder."""
+    """Run or resume the stage; writes the policy and `episodes.csv` into the run's folder."""
     return finetune_all([config])[0]
 
 
 def finetune_all(
     configs: Sequence[FinetuneConfig], words: Sequence[Sequence[str] | None] | None = None
 ) -> list[RunFolder]:
-    """Run the stage, or resume it, for several runs at once, whose updates are one (see `finetune.stack`).
+    """Run or resume the stage for several runs, with shared updates (see `finetune.stack`).
 
     Args:
-        configs: of each run; they may differ in seeds, encoder, data, and how they are evaluated.
-        words: of each run's own command, for its record.
+        configs: one per run; may differ in seeds, encoder, data and evaluation settings.
+        words: command-line words of each run, for its record.
 
     Raises:
-        UserError: settings that cannot work, or runs that do not stack.
-        FloatingPointError: a run diverged; the others were trained to their end.
+        UserError: invalid settings, or runs that cannot be stacked.
+        FloatingPointError: a run diverged; the others were trained to the end.
     """
     datasets: dict[Path, Dataset] = {}
     asked = [_Asked(config, datasets, own) for config, own in zip(configs, words or [None] * len(configs), strict=True)]
@@ -64,10 +64,10 @@ def finetune_all(
 
 
 class _Asked:
-    """A run that was asked for, and what it reads."""
+    """A requested run and its inputs."""
 
     def __init__(self, config: FinetuneConfig, datasets: dict[Path, Dataset], words: Sequence[str] | None) -> None:
-        """Read what a config names, sets only where they are not among those that were opened; nothing is written."""
+        """Read the inputs of a config, reusing datasets that are open. Writes nothing."""
         config.check()
         refuse_inside(config.out)
         self.dataset = dataset = datasets.get(config.data) or open_dataset(config.data)
@@ -83,14 +83,14 @@ class _Asked:
             dataset.require_states()
         self.device = pick_device(config.device)
         untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
-        self.card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
+        self.card = replace(card, quality=dataset.quality or untold)  # rows carry the quality of the policy's dataset
         inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
         self.before = read_record(config.encoder)
         plan = read_plan(config.data)
         self.run = RunFolder(config.out, STAGE, config, inputs, RESULTS, self.before.parts, plan, words)
 
     def trainer(self) -> FinetuneTrainer:
-        """What trains the run, whose folder is owned; encodes the set."""
+        """Create the run's trainer, which encodes the dataset. The run's folder must be owned."""
         what = "it was pretrained; pretrain it again"
         warn_of_other_code(self.config.encoder, vars(self.before), self.before.parts, what)
         self.dataset.to(self.device)
@@ -101,11 +101,11 @@ ALIKE = (
     *("algorithm", "updates", "batch_size", "hidden_dim", "learning_rate", "update_precision", "views", "device"),
     *("eval_every", "log_every", "checkpoint_every"),
 )
-"""Settings that runs of a stack share, besides the algorithm's options."""
+"""Settings that all runs of a stack must share, besides the algorithm's options."""
 
 
 def _refuse_unlike(asked: Sequence[_Asked]) -> None:
-    """Raise UserError for runs that do not stack, naming two and what they differ in."""
+    """Raise UserError for runs that cannot be stacked, naming two of them and the difference."""
     first = asked[0]
     for number, one in enumerate(asked):
         if one.card.end_to_end:
@@ -123,17 +123,17 @@ def _refuse_unlike(asked: Sequence[_Asked]) -> None:
 
 
 def _alike(asked: _Asked) -> list[tuple[str, Any]]:
-    """What runs of a stack share, in words and by value; the algorithm first, which decides what options there are."""
+    """What runs of a stack must share, as (description, value). The algorithm comes first: it decides the options."""
     settings = {name: getattr(asked.config, name) for name in ALIKE} | flat(asked.config.options)
     widths = [("the representations' width", asked.encoder.dim), ("the actions' width", asked.dataset.action_dim)]
     return [(flag_of(name), value) for name, value in settings.items()] + widths
 
 
 class Updates:
-    """Updates of one run, or of several at once; replayed where a GPU is."""
+    """Updates of one run or a stack, replayed as CUDA graphs on a GPU."""
 
     def __init__(self, trainers: Sequence[FinetuneTrainer]) -> None:
-        """Begin where the trainers stand."""
+        """Start from the trainers' current state."""
         first = trainers[0].algorithm
         self._algorithm: Algorithm | EndToEnd = first
         self._sampler: Any = trainers[0].sampler
@@ -147,7 +147,7 @@ class Updates:
         device = first.policy.standardise.mean.device
         precision = trainers[0].config.update_precision
         set_products(device, precision)
-        # not cached, because weights move between the losses of an update
+        # no cache: weights change between the losses of an update
         self._precise = torch.autocast(device.type, torch.bfloat16, precision == "bf16", cache_enabled=False)
         streams, trained = [self._sampler.draws, self._counting.draws], [self._algorithm, self._counting]
         self._replay = Replay(self._update, device, streams, self._counting.period, trained)
@@ -155,7 +155,7 @@ class Updates:
             self._counting.count_on(device)
 
     def __call__(self, made: int) -> dict[str, torch.Tensor]:
-        """The update after so many: its scalars, of several runs a number each."""
+        """Do the update that follows `made` updates. Returns scalars, (S,) for a stack."""
         return self._replay(made % self._counting.period)
 
     def _update(self, turn: int) -> dict[str, torch.Tensor]:
@@ -171,10 +171,10 @@ def _settle(trainer: FinetuneTrainer, stack: Stack, sampler: StackedSampler, num
 
 
 def train(trainers: Sequence[FinetuneTrainer]) -> None:
-    """Train runs to their end; those after the same update together, and those that are behind the others first.
+    """Train runs to the end: those at the same update together, those that are behind first.
 
     Raises:
-        FloatingPointError: one diverged, and is marked; the others were trained to their end.
+        FloatingPointError: a run diverged and is marked; the others were trained to the end.
     """
     left, diverged = list(trainers), list[FloatingPointError]()
 
@@ -210,7 +210,7 @@ def train(trainers: Sequence[FinetuneTrainer]) -> None:
                 if loops[0].due(settings.log_every):
                     each(lambda one: one.loop.log(), group)
                 if loops[0].due(settings.eval_every):
-                    save([one.loop for one in group if one in left])  # first: a kill while it plays costs no update
+                    save([one.loop for one in group if one in left])  # before playing: a kill then costs no update
                     each(FinetuneTrainer.evaluate, group)
                 loops[:] = [one.loop for one in group if one in left]
             for one in group:

@@ -1,4 +1,4 @@
-"""One fine-tuning: what is trained on which batches, how it is evaluated, and what its folder keeps."""
+"""Trainer of one fine-tuning run: algorithm, batches, evaluation and output files."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.run import RunFolder
 
 RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
-"""What a finished run holds."""
+"""Files of a finished run."""
 FEATURES_FILE = "features.npy"
 PATH_EPISODES = 20
-"""Episodes that the error on the data's path is measured on, evenly spaced among those that hold a decision."""
+"""Maximum episodes for the error on the data's own path, evenly spaced among those with at least one decision."""
 STANDARDISED_BY = 1024
-"""Least transitions whose representations give their means and deviations, where none are kept (`--views 0`)."""
+"""Minimum transitions for estimating feature means and standard deviations without cached features (`--views 0`)."""
 
 
 def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
-    """The columns that name a run's rows."""
+    """Columns that identify a run's rows."""
     before = {"method": card.method, "task": card.task, "quality": card.quality}
     return before | {"corruption": card.corruption["corruption"], "algorithm": config.algorithm, "seed": config.seed}
 
@@ -71,18 +71,18 @@ def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
 def make_trainer(
     config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder
 ) -> FinetuneTrainer:
-    """What a run trains and on which batches: cached features, features encoded anew, or pixels.
+    """Build a run's trainer, with batches from cached features, from features encoded on the fly, or from pixels.
 
     Args:
         config: settings of the run.
-        dataset: its set, on the device.
-        encoder: on the device, too.
-        card: of the encoder, with the set's quality.
-        run: its folder, which is owned; labels, encoder and features are written there.
+        dataset: its dataset, on the device.
+        encoder: on the device too.
+        card: the encoder's metadata, with the dataset's quality.
+        run: its folder, which must be owned; labels, encoder and features are written there.
     """
     write_json(run.path / LABELS_FILE, labels_of(config, card))
     if not all((run.path / name).exists() for name in FILES_OF_RUN):
-        # copied, so that the run can be evaluated wherever it is moved; the pretraining's seconds, too
+        # copied, with the pretraining's timing, so that the run can be moved and evaluated anywhere
         if (timing := config.encoder.parent / TIMING_FILE).exists():
             write_json(run.path / PRETRAIN_TIMING_FILE, read_json(timing))
         changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
@@ -90,7 +90,7 @@ def make_trainer(
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     draws = random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
-    corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: what is hidden belongs to the world
+    corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: the corruption is part of the environment
     returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed_of_views)
     encode: Callable[[int], torch.Tensor] = partial(frozen.episode, view=frozen.view(0))
@@ -125,16 +125,16 @@ def path_error(
     encode: Callable[[int], torch.Tensor],
     policy: Callable[[torch.Tensor], torch.Tensor],
 ) -> float:
-    """How far a policy is from the actor that made the data, on the data's own path.
+    """Difference between a policy and the data's behaviour policy, on the data's own states.
 
     Args:
-        dataset: a set with simulator states.
-        actor: what made it.
-        encode: representations (rows, D) of the episode of a number.
-        policy: from (rows, D) to actions (rows, A).
+        dataset: a dataset with simulator states.
+        actor: the behaviour policy.
+        encode: episode number -> representations (rows, D).
+        policy: (rows, D) -> actions (rows, A).
 
     Returns:
-        Mean squared difference from the actor's mean action over all decisions of PATH_EPISODES episodes at most.
+        Mean squared difference to the actor's mean action over all decisions of at most PATH_EPISODES episodes.
     """
     assert dataset.task is not None
     assert dataset.physics is not None
@@ -144,7 +144,7 @@ def path_error(
     last = len(deciding) - 1
     errors = []
     for number in deciding[np.unique(np.linspace(0, last, min(last + 1, PATH_EPISODES)).astype(int))].tolist():
-        physics = dataset.physics[dataset.rows_of(number)][:-1]  # an episode's last row decides nothing
+        physics = dataset.physics[dataset.rows_of(number)][:-1]  # no decision at an episode's last row
         shown = np.array([actor.act(state) for state in observed_states(task, physics)])
         actions = policy(encode(number)[:-1]).cpu().numpy()
         errors.append(np.square(actions - shown.reshape(actions.shape)).mean(1))
@@ -152,7 +152,7 @@ def path_error(
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
-    """Write how well the first view tells the simulator state, if the set stores it and has an episode to hold out."""
+    """Write how well the first view predicts the simulator state. Needs stored states and an episode to hold out."""
     if dataset.physics is None or dataset.task is None or dataset.num_episodes < 2:
         return
     if (run.path / PROBE_FILE).exists():
@@ -165,10 +165,10 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
 
 
 class FinetuneTrainer:
-    """One run: an algorithm, its stream of batches, and where the results go."""
+    """One run: an algorithm, its batches, and where the results go."""
 
     loop: Loop
-    """While it is trained."""
+    """Set while training."""
 
     def __init__(
         self,
@@ -185,22 +185,22 @@ class FinetuneTrainer:
         self.reference, self.path_error = reference, path_error
         self.step = 0
         self.settle: Callable[[], None] = lambda: None
-        """Brings algorithm and sampler to the last update's state, where others make the updates."""
+        """Brings algorithm and sampler up to date when a stack makes the updates."""
 
     def begin(self, title: str) -> AbstractContextManager[Loop]:
-        """Open the loop, from the newest checkpoint if there is one; a run without a title shows no progress."""
+        """Open the training loop, resuming from the newest checkpoint. No progress is shown without a title."""
         self.reference.write(self.folder.path)
         labels, total = labels_of(self.config, self.card), self.config.updates
         return training(self.folder, self, title, total, "updates", labels=labels, card=asdict(self.card))
 
     def resume(self) -> None:
-        """Drop what is newer than the checkpoint, and make up for an evaluation that was cut off behind it."""
-        drop_episodes_after(self.folder.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
+        """Drop evaluations newer than the checkpoint, and repeat one that was interrupted right after it."""
+        drop_episodes_after(self.folder.path / EPISODES_FILE, self.step)  # left by a checkpoint that was lost
         if self.step and self.loop.due(self.config.eval_every):
             self.evaluate()
 
     def finish(self) -> None:
-        """Write what a trained run ends with."""
+        """Write the final files of a trained run."""
         path = self.folder.path
         if self.path_error:
             self.reference.with_path_error(self.path_error(self.algorithm.policy)).write(path)
@@ -212,9 +212,9 @@ class FinetuneTrainer:
         self.folder.finish(updates=self.step)
 
     def evaluate(self) -> None:
-        """Keep this step's policy, play its episodes unless their rows are there, and log the scores.
+        """Save this step's policy, play its episodes unless their rows exist, and log the scores.
 
-        The step's checkpoint is kept: while it plays, a signal need not wait.
+        The step's checkpoint is saved before, so signals may interrupt the episodes.
 
         Raises:
             FloatingPointError: a weight is not finite.
@@ -243,7 +243,7 @@ class FinetuneTrainer:
         loop.show(score=scores[f"{EVALUATION}score/{own.corruption}"])
 
     def _play(self, run: RunFolder, under: list[tuple[CorruptionConfig, int]]) -> list[Row]:
-        """Play so many episodes under each, keep a film of the first, then append the rows of all: the result."""
+        """Play the given number of episodes under each corruption, save a film of the first, then append all rows."""
         config, task = self.config, TASKS.named(self.card.task)
         drop_episodes_after(run.path / EPISODES_FILE, self.step - 1)
         jobs = [
@@ -260,13 +260,13 @@ class FinetuneTrainer:
         return rows
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to resume to the bit."""
+        """Everything needed to resume bit-identically."""
         self.settle()
         parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
         return {"step": self.step} | parts
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`."""
+        """Resume from `state`."""
         self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])

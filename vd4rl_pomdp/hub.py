@@ -1,9 +1,8 @@
-"""Encoders, agents and data sets on the Hugging Face Hub, by huggingface_hub's own transfers.
+"""Push and pull encoders, agents and data sets to and from the Hugging Face Hub, with huggingface_hub.
 
-A repository that `push` wrote holds a listing beside the files: their kind, their licence, and the SHA-256 of each, by
-which `pull` judges what it was sent. Encoders and agents are model repositories, OWNER/NAME; data sets are
-datasets/OWNER/NAME, as in the Hub's own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT,
-HF_TOKEN, `hf auth login`.
+`push` adds a listing, vd4rl_pomdp.json: the kind, the licence and the SHA-256 of every file, which `pull` verifies.
+Encoders and agents are model repositories, OWNER/NAME; data sets are datasets/OWNER/NAME, as in the Hub's URLs.
+Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
 """
 
 from __future__ import annotations
@@ -43,31 +42,31 @@ from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 
 LISTING = "vd4rl_pomdp.json"
-"""Name of the listing beside the files."""
+"""File name of the listing."""
 ENCODER, AGENT, SET = "an encoder", "an agent", "a data set"
-"""What a repository holds, in the words of `runs.outputs.kept_in`."""
+"""Kinds of repository, named as by `runs.outputs.kept_in`."""
 _FORMAT = 1
 _FILES = {ENCODER: (CONFIG, WEIGHTS), AGENT: (*agents.FILES, agents.CARD)}
 _MODEL = [name for names in _FILES.values() for name in names]
 _PATTERNS = {ENCODER: _MODEL, AGENT: _MODEL, SET: ["*.hdf5", "*.HDF5", "*.h5", "*.H5", "*.json", "*.md", "*.png"]}
-"""Files of each kind: a push replaces all of them, and leaves whatever else its owner keeps there."""
+"""Files of each kind: a push replaces all of these and leaves the repository's other files alone."""
 
 
 def push(folder: Path, repository: str, private: bool = False, revision: str = "main", license: str = LICENSE) -> str:
-    """Write an encoder, an agent or a data set as one commit; returns its address.
+    """Push an encoder, an agent or a data set as one commit; returns the commit's URL.
 
     Args:
-        folder: an encoder's, an agent's or a set's folder, which is checked first.
-        repository: OWNER/NAME or datasets/OWNER/NAME, made if there is none; one of something else is refused.
-        private: make it private.
-        revision: branch to write to, made if there is none.
-        license: the licence that its card names, as the Hub spells it.
+        folder: the folder of the encoder, agent or data set; its contents are checked first.
+        repository: OWNER/NAME or datasets/OWNER/NAME, created if needed; must not hold files from elsewhere.
+        private: create the repository as private.
+        revision: branch to push to, created if needed.
+        license: Hub identifier of the licence for the card, such as "mit".
 
     Raises:
-        UserError: the folder holds neither or a damaged one, or the Hub refuses or cannot be reached.
+        UserError: the folder holds nothing of that kind or is damaged, or the Hub refuses or cannot be reached.
     """
     name, kind = _repository(repository)
-    held = kept_in(folder) or (SET if shard_files(folder) else None)  # a damaged shard is told what is wrong with it
+    held = kept_in(folder) or (SET if shard_files(folder) else None)  # `_checked` below reports damaged shards
     kind = AGENT if (kind, held) == (ENCODER, AGENT) else kind
     if held != kind:
         raise UserError(
@@ -90,7 +89,7 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
             api.create_branch(**where, branch=revision, exist_ok=True)
         for file, place in names.items():
             (Path(staged) / place).parent.mkdir(exist_ok=True)
-            # A link: a set may be larger than what is free for temporary files.
+            # A link, since a data set may not fit into the temporary folder.
             (Path(staged) / place).symlink_to(file.resolve())
         write_bytes(Path(staged) / CARD, card.encode())
         write_json(Path(staged) / LISTING, listing)
@@ -102,17 +101,17 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
 
 
 def pull(repository: str, folder: Path, revision: str = "main") -> bool:
-    """Fetch an encoder, an agent or a data set; returns whether anything was: what is there and right is left as it is.
+    """Download an encoder, an agent or a data set; returns False if `folder` already holds exactly that.
 
-    A pull that was cut is resumed; `folder` appears when all of it is there and right.
+    An interrupted pull is resumed. `folder` is created only when everything is downloaded and verified.
 
     Args:
-        repository: one that `push` wrote.
-        folder: folder to make; an empty one will do.
+        repository: a repository written by `push`.
+        folder: folder to create; it may exist if empty.
         revision: branch, tag or commit.
 
     Raises:
-        UserError: the folder holds something else, what was sent is damaged, or the Hub refuses or cannot be reached.
+        UserError: the folder holds something else, a download is damaged, or the Hub refuses or cannot be reached.
     """
     _, kind = _repository(repository)
     folder = Path(os.path.abspath(folder))
@@ -122,11 +121,11 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
         told = api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=scratch)
         listing, license, kind = _read_listing(Path(told), kind, repository)
         if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-            others = {shard.name for shard in shard_files(folder)} - listing.keys()  # would make it another set
+            others = {shard.name for shard in shard_files(folder)} - listing.keys()  # extra shards: another data set
             if folder.is_dir() and not others and not _wrong(folder, listing):
                 return False
             raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
-        # Beside the folder, so that the rename at the end is one step; its name tells the next pull what to resume.
+        # Next to the folder, so that the final rename is atomic; its fixed name lets the next pull resume.
         api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
     with disk_errors(folder):
         if wrong := _wrong(staged, listing):
@@ -136,7 +135,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             )
         kept = {name.partition("/")[0] for name in listing}
         for path in list(staged.iterdir()):
-            if path.name not in kept:  # of huggingface_hub, or of a cut pull of another repository
+            if path.name not in kept:  # huggingface_hub's cache, or left by an interrupted pull of another repository
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         _checked(staged, kind)
         if kind == ENCODER:
@@ -146,7 +145,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
 
 
 def _repository(text: str) -> tuple[str, str]:
-    """Name and kind of OWNER/NAME, an encoder's, or datasets/OWNER/NAME, a set's."""
+    """Parse OWNER/NAME (an encoder) or datasets/OWNER/NAME (a data set) into ("OWNER/NAME", kind)."""
     name = text.removeprefix("datasets/")
     if name.count("/") != 1 or not all(name.split("/")):
         raise UserError(
@@ -157,7 +156,7 @@ def _repository(text: str) -> tuple[str, str]:
 
 @contextmanager
 def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
-    """Client and the repository as its methods take it; what the Hub refuses, or its absence, is one sentence."""
+    """Yield the API client and its repository arguments; turns the Hub's errors into one-line UserErrors."""
     if not sys.stderr.isatty():
         disable_progress_bars()
     name, kind = _repository(repository)
@@ -176,7 +175,7 @@ def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
 
 
 def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str], str, str]:
-    """SHA-256 by name of what a repository lists, its licence and its kind; UserError if the listing is damaged."""
+    """Read a listing: (SHA-256 by file name, licence, kind); UserError if it is damaged."""
     listing = read_json(path)
     files = listing.get("sha256")
     files = files if isinstance(files, dict) else {}
@@ -190,12 +189,12 @@ def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str
 
 
 def _wrong(folder: Path, listing: dict[str, str]) -> list[str]:
-    """Files of a listing that a folder has not, or with another content."""
+    """Listed files that are missing from a folder or have another SHA-256."""
     return [n for n, digest in listing.items() if not (folder / n).is_file() or sha256(folder / n) != digest]
 
 
 def _checked(folder: Path, kind: str) -> list[Path]:
-    """Files of a kind in a folder; UserError if the encoder does not load, or the set's rows are not whole."""
+    """Check a folder's contents and return its files; UserError if a model does not load or a data set has gaps."""
     if kind in _FILES:
         (load_encoder if kind == ENCODER else agents.load_agent)(folder)
         return [folder / name for name in _FILES[kind]]
@@ -207,7 +206,7 @@ def _checked(folder: Path, kind: str) -> list[Path]:
 
 
 def _agent_card(folder: Path, repository: str, license: str) -> str:
-    """README.md of an agent: its card, and how to load it."""
+    """README.md of an agent: its card and how to load it."""
     card = read_json(folder / agents.CARD)
     names = [str(card.get(name)) for name in ("method", "algorithm", "task")]
     values = {
@@ -227,7 +226,7 @@ def _agent_card(folder: Path, repository: str, license: str) -> str:
 
 
 def _set_card(folder: Path, repository: str, license: str) -> str:
-    """README.md of a data set: its data card, or what its files tell if it has none."""
+    """README.md of a data set: its data card or, if it has none, a title from its files' attributes."""
     names = task_and_quality(folder, [read_attributes(shard) for shard in shard_paths(folder)])
     told = folder / "card.md"
     title = f"# {', '.join(code(name or 'unknown') for name in names)}\n"

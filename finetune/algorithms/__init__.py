@@ -1,4 +1,4 @@
-"""Every fine-tuning algorithm by name."""
+"""All fine-tuning algorithms by name."""
 
 from __future__ import annotations
 
@@ -36,4 +36,5 @@ ALGORITHMS: Registry[type[Algorithm]] = Registry(
     "a class of finetune.algorithms.Algorithm",
     lambda name, part: refuse_options(part.options),
 )
-"""All algorithms. Packages offer theirs in the group of entry points `vd4rl_pomdp.algorithms`; each names a class."""
+"""All algorithms. Packages add theirs through the entry-point group `vd4rl_pomdp.algorithms`; each entry names a
+class."""

@@ -1,4 +1,4 @@
-"""What a fine-tuning algorithm is: plain losses of a batch, and the order in which an update minimises them."""
+"""Base class of fine-tuning algorithms: plain losses of a batch, and an update that minimises them in order."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ReturnOptions(Options):
     """Options of algorithms that estimate returns."""
 
     gamma: float = 0.99
-    """Discount of a decision."""
+    """Discount per decision."""
     n_step: int = 3
     """Steps of the n-step return."""
 
@@ -37,110 +37,112 @@ class Loss(NamedTuple):
     value: Tensor
     """Scalar."""
     logs: dict[str, Tensor]
-    """Detached scalars by name; no two losses of an update share one, and none is called `step`."""
+    """Detached scalars by name, unique among the losses of an update; `step` is reserved."""
 
 
 class Algorithm(ABC):
     """Trains a policy on batches of representations.
 
-    Where updates are replayed, Python runs a few of them only; where runs are stacked, `update` sees all of theirs at
-    once, and each loss one (`stack`). Neither needs a line in an algorithm that keeps to what is said here.
+    When updates are replayed as CUDA graphs, Python runs only a few of them. When runs are stacked
+    (`finetune.stack`), `update` sees the batches of all runs at once, but each loss sees one. An algorithm that
+    follows this interface needs no extra code for either.
     """
 
     options: type[Options] = Options
     """Class of its options."""
     summary: str = ""
-    """One line that says what it is."""
+    """One-line description."""
     period: int = 1
-    """Updates after which Python does the same again."""
+    """Number of updates after which the Python control flow repeats, e.g. 2 if every second update trains the actor."""
 
     def __init__(self, policy: Policy, options: Any, learning_rate: float, updates: int, draws: RandomStream) -> None:
         """Subclasses add their networks and optimisers.
 
         Args:
-            policy: what is trained; its device is where everything else belongs.
-            options: an instance of the class's `options`, kept as `settings`.
-            learning_rate: of all optimisers.
-            updates: how many there will be, for schedules, kept as `planned`.
-            draws: what random numbers are drawn from, in `update` and not in a loss: a stack's update draws for all.
+            policy: the policy to train; everything else must be on its device.
+            options: an instance of the class's `options`, stored as `settings`.
+            learning_rate: for all optimisers.
+            updates: total number of updates, for schedules; stored as `planned`.
+            draws: source of random numbers. Draw in `update`, never in a loss: a stack's update draws for all
+                runs.
         """
         self.policy, self.settings, self.learning_rate = policy, options, learning_rate
         self.planned, self.draws = updates, draws
         self.updates: int | Tensor = 0
-        """Updates that were made: a number, or where they are replayed a tensor without dimensions."""
+        """Updates done: an int or, when replayed, a 0-dim tensor."""
         self._turn = 0
 
     @property
     def turn(self) -> int:
-        """Which update of a `period` is made, 0 to period - 1: a number of Python's, to decide by."""
+        """Position of the current update within a `period`, 0 to period - 1, as an int for Python control flow."""
         return self._turn if isinstance(self.updates, Tensor) else self.updates % self.period
 
     def count_on(self, device: torch.device) -> None:
-        """Count updates by a tensor from now on, which replayed updates can read and add to."""
+        """Count updates in a tensor from now on, which replayed updates can read and increment."""
         self.updates = torch.tensor(int(self.updates), device=device)
 
     def take_turn(self, turn: int) -> None:
-        """Tell the turn of the update that comes, which no tensor can."""
+        """Set the turn of the next update, since Python cannot branch on a tensor during capture."""
         self._turn = turn
 
     @abstractmethod
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """`minimise` each loss in turn, and count the update: `self.updates += 1`.
+        """Call `minimise` for each loss in turn, then count the update: `self.updates += 1`.
 
         Args:
-            batch: transitions of representations; of stacked runs each tensor has a leading dimension more, S.
-            encoder: optimiser of what computed `batch.z`, where that is trained, too: it takes the step along the first
-                loss, the only one whose gradient may reach `batch.z`.
+            batch: transitions of representations; for stacked runs, tensors have a leading dimension S.
+            encoder: optimiser of the encoder that computed `batch.z`, if it is trained. It steps along the
+                first loss, the only one whose gradient may reach `batch.z`.
 
         Returns:
-            Detached scalars of all losses by name, (S,) of stacked runs.
+            Detached scalars of all losses by name; (S,) for stacked runs.
         """
 
     def minimise(
         self, loss_function: Callable[..., Loss], batch: FeatureBatch, *tensors: Tensor, along: Sequence[Optimizer]
     ) -> dict[str, Tensor]:
-        """Compute a loss of one run's batch and tensors, and step along its gradient.
+        """Compute a loss for each run's batch and tensors, and take a gradient step.
 
         Args:
-            loss_function: a method of this algorithm; it changes nothing and draws nothing.
+            loss_function: a method of this algorithm that changes nothing and draws nothing.
             batch: its first argument.
-            tensors: what else it is given, random numbers that were drawn for it, say.
-            along: optimisers whose parameters move.
+            tensors: its other arguments, e.g. random numbers drawn for it.
+            along: optimisers whose parameters are updated.
 
         Returns:
-            What it logs.
+            The loss's logs.
         """
         loss = self.each(loss_function, batch, *tensors)
         self.step(loss, *along)
         return dict(loss.logs)
 
     def each(self, function: Callable[..., Result], batch: FeatureBatch, *tensors: Tensor) -> Result:
-        """What a function that is no loss computes of a batch; of stacked runs, of each one's."""
+        """Apply a function that is not a loss to a batch; for stacked runs, to each run's batch."""
         return function(batch, *tensors)
 
     def step(self, loss: Loss, *optimisers: Optimizer) -> None:
-        """Step along the gradient of a loss, which is taken in full precision; only the optimisers' parameters move."""
+        """Take a gradient step in full precision. Only the optimisers' parameters change."""
         for optimiser in optimisers:
             optimiser.zero_grad(set_to_none=True)
         asked = [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
         with torch.autocast(loss.value.device.type, enabled=False):
-            # an actor's loss runs through the critics, whose own gradients are neither wanted nor computed;
-            # losses of stacked runs share no parameter, so the gradient of their sum is each one's own
+            # `inputs` skips gradients of the critics, through which an actor's loss runs. Stacked runs share no
+            # parameters, so the gradient of the sum of their losses is each run's own.
             loss.value.backward(torch.ones_like(loss.value), inputs=asked)
         for optimiser in optimisers:
             optimiser.step()
 
     def parts(self) -> dict[str, Any]:
-        """The networks, targets and optimisers among its attributes, by name. The target of `x` is `target_x`."""
+        """The networks, targets and optimisers among its attributes, by name. The target of `x` is named `target_x`."""
         return {name: part for name, part in vars(self).items() if isinstance(part, nn.Module | Optimizer)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume: the state of all parts, the updates made, the noise."""
+        """Everything needed to resume: the state of all parts, the number of updates, the noise."""
         parts = {name: part.state_dict() for name, part in self.parts().items()}
         return parts | {"updates": int(self.updates), "noise": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Resume from `state_dict`."""
         for name, part in self.parts().items():
             part.load_state_dict(state[name])
         if isinstance(self.updates, Tensor):
@@ -151,7 +153,7 @@ class Algorithm(ABC):
 
 
 def share_of(done: int | Tensor, whole: float) -> float | Tensor:
-    """How much of a whole is done, 1 at most: a number of a number, a tensor of one."""
+    """Completed fraction of `whole`, at most 1; a float or, for a tensor, a tensor."""
     if isinstance(done, Tensor):
         return (done.double() / whole).clamp(max=1.0)
     return min(1.0, done / whole)

@@ -3,18 +3,18 @@
     critics   y = r + gamma d min_i Q'_i(z', a'),   a' = pi(z') + clipped noise of a scheduled std
     actor     max  lambda min_i Q_i(z, a~) - (a~ - a)^2,   a~ = pi(z) + the same noise, lambda = alpha / mean |Q|
 
-Noisy actions are cut off at -1 and 1, and the gradient passes there as if they were not.
+Noisy actions are clipped to [-1, 1] with a straight-through gradient.
 
 Authors' code: github.com/conglu1997/v-d4rl (drqbc).
 
-Differences to TD3+BC here: no target actor, an actor step with every critic step, noise that decays linearly from 1.0
-to 0.1 over 250k updates, or half of a shorter training, and is on the cloned action, too, tau 0.01.
+Differences from TD3+BC here: no target actor; an actor step with every critic step; noise that decays linearly from 1.0
+to 0.1 over 250k updates (or half of a shorter training) and is also added to the cloned action; tau 0.01.
 
-Differences to the authors' loop:
-- Representations go straight into the networks, standardised where the encoder is frozen. The authors' actor and critic
-  each begin with a trunk of their own (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's
-  trunk is averaged like the rest of it; here memoryless encoders end in such a layer, which all share, frozen or not
-  (see `end_to_end`).
+Differences from the authors' training loop:
+- Representations go straight into the networks, standardised if the encoder is frozen. The authors' actor and critic
+each begin with their own trunk (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's trunk is
+averaged like the rest of it. Here memoryless encoders end with such a layer, shared by all, frozen or not (see
+`end_to_end`).
 - Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
 """
 
@@ -38,7 +38,7 @@ class DrQv2BC(TD3BC):
     period = 1
 
     def next_noise(self, batch: FeatureBatch) -> Tensor:
-        """Noise for the next actions, of a scheduled size; the actor's own have the like."""
+        """Scheduled noise for the next actions; `actor_noise` is distributed the same."""
         return self.draws.normal(*batch.action.shape) * noise_at(self.updates, self.planned)
 
     def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:

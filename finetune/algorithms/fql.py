@@ -4,19 +4,20 @@
     flow      min  (v(z, x_t, t) - (a - x_0))^2,   x_t = (1 - t) x_0 + t a,   x_0 ~ N(0, I),   t ~ U(0, 1)
     policy    max  lambda mean_i Q_i(z, mu(z, e)) - alpha (mu(z, e) - flow(z, e))^2,   lambda = 1 / mean |Q|
 
-Behaviour is cloned by a flow, which may have several modes: from noise e at time 0 the velocity v leads to an action at
-time 1, in ten Euler steps. A one-step policy mu is distilled from it, so that no gradient runs through the steps, and
-seeks what the critics value. All learn from one loss, each from the others as they were before the update.
+A flow clones the behaviour policy and can be multimodal: its velocity v transports noise e at time 0 to an action at
+time 1, in ten Euler steps. A one-step policy mu is distilled from it, which avoids backpropagation through the steps,
+and also maximises Q. All networks are trained by one summed loss, each against the others' weights from before the
+update.
 
-The policy that is kept is mu(z, 0), the action at the noise's mode: evaluation here is of deterministic policies. Its
-network is mu's but for the noise, which enters the first hidden layer by weights of its own (`NoiseIn`).
+The saved policy is mu(z, 0), the action at the noise's mode, since evaluation here is deterministic. Its network is
+mu's without the noise, which enters the first hidden layer through separate weights (`NoiseIn`).
 
 Authors' code: github.com/seohongpark/fql (agents/fql.py).
 
-Differences: states are frozen representations, standardised; returns are n-step. mu is the policy of every algorithm
-here: two rectified hidden layers and tanh (theirs: four of GELU, cut off at -1 and 1). They act by fresh noise in every
-step. lambda is the authors' recommendation for new tasks, not what the paper ran (there 1). Initial weights are
-PyTorch's (theirs: Glorot's, zero biases).
+Differences: states are frozen representations, standardised; returns are n-step. mu is the policy network of all
+algorithms here: two ReLU layers and tanh (theirs: four GELU layers, clipped to [-1, 1]). They act with fresh noise at
+every step. lambda follows the authors' recommendation for new tasks (the paper's runs used 1). Initial weights are
+PyTorch's (theirs: Glorot, zero biases).
 """
 
 from __future__ import annotations
@@ -51,15 +52,15 @@ class FQLOptions(ReturnOptions):
     """Options of FQL."""
 
     distillation: float = 1.0
-    """FQL's alpha: weight of the one-step policy's distance from the flow, against the critics."""
+    """FQL's alpha: weight of the one-step policy's distance from the flow, relative to the critics."""
     normalise_q: bool = True
-    """Divide what the policy maximises by its mean size, so that --distillation suits rewards of any scale."""
+    """Divide the policy's objective by the mean |Q|, so that --distillation suits rewards of any scale."""
 
     limits: ClassVar[Limits] = {"distillation": 0}
 
 
 class Flow(nn.Module):
-    """Velocity of an action under way: (B, D), (B, A), (B, 1) -> (B, A)."""
+    """Velocity field over actions: (B, D), (B, A), (B, 1) -> (B, A)."""
 
     def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
         super().__init__()
@@ -73,8 +74,8 @@ class Flow(nn.Module):
         return self._velocity(self.state(z), x, t)
 
     def act(self, z: Tensor, noise: Tensor) -> Tensor:
-        """Where (B, A) noise is led to: actions (B, A) in [-1, 1]."""
-        state, x = self.state(z), noise  # all steps share what the state gives to the first layer
+        """Transport (B, A) noise to actions (B, A) in [-1, 1]."""
+        state, x = self.state(z), noise  # the state's contribution to the first layer is the same in all steps
         for step in range(STEPS):
             x = x + self._velocity(state, x, torch.full_like(x[:, :1], step / STEPS)) / STEPS
         return x.clamp(-1, 1)
@@ -84,7 +85,8 @@ class Flow(nn.Module):
 
 
 class NoiseIn(nn.Linear):
-    """What noise adds to the first hidden layer of a policy's network: without it, the policy is what it is at 0."""
+    """Contribution of noise to a policy's first hidden layer. It is 0 at zero noise, so the policy alone is mu(z,
+    0)."""
 
     def __init__(self, action_dim: int, hidden: int) -> None:
         super().__init__(action_dim, hidden, bias=False)
@@ -118,7 +120,7 @@ class FQL(Algorithm):
         self.optimiser = Adam([p for module in learnt for p in module.parameters()], learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """One step of all networks along the one loss, then one of the critics' targets."""
+        """One step of all networks on the summed loss, then one of the critics' targets."""
         shape = batch.action.shape
         next_noise, start, noise = (self.draws.normal(*shape) for _ in range(3))
         time = self.draws.uniform(*shape[:-1], 1)
@@ -128,13 +130,13 @@ class FQL(Algorithm):
         return logs
 
     def loss(self, batch: FeatureBatch, next_noise: Tensor, start: Tensor, time: Tensor, noise: Tensor) -> Loss:
-        """Sum of three losses without a network in common: their critics, flow and actions are numbers to each other.
+        """Sum of three losses, each of which treats the other two's networks as constants.
 
         Args:
             batch: transitions.
             next_noise: (B, A), of the next actions.
-            start: (B, A), where the flow that is cloned starts.
-            time: (B, 1), and how far it is.
+            start: (B, A), start points of the cloned flow.
+            time: (B, 1), times along the flow.
             noise: (B, A), of the policy's actions.
         """
         critic, flow, policy = (
@@ -145,7 +147,7 @@ class FQL(Algorithm):
         return Loss(critic.value + flow.value + policy.value, critic.logs | flow.logs | policy.logs)
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Mean squared error of both critics, to the same target y."""
+        """Mean squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value = _mean(self.target_critic(next_z, self.noise_in.act(self.policy, next_z, noise)))
@@ -155,20 +157,20 @@ class FQL(Algorithm):
         return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
 
     def flow_loss(self, batch: FeatureBatch, start: Tensor, time: Tensor) -> Loss:
-        """Squared error of the velocity on the straight way from noise to the action taken."""
-        z = self.policy.standardise(batch.z.detach())  # the critics' loss alone trains an encoder
+        """Squared error of the velocity on the straight line from noise to the data's action."""
+        z = self.policy.standardise(batch.z.detach())  # an encoder is trained by the critics' loss only
         velocity = self.flow(z, torch.lerp(start, batch.action, time), time)
         loss = F.mse_loss(velocity, batch.action - start)
         return Loss(loss, {"flow_loss": loss.detach()})
 
     def policy_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Distance from the flow's actions, less the value."""
+        """Distance from the flow's actions, minus the value."""
         z = self.policy.standardise(batch.z.detach())
         with torch.no_grad():
             cloned = self.flow.act(z, noise)
         chosen = self.noise_in.act(self.policy, z, noise)
         distance = F.mse_loss(chosen, cloned)
-        # weights as numbers: the critics share this update, and must not learn to value what is chosen
+        # constant weights: this loss must not train the critics to overrate the policy's actions
         frozen = {name: weight.detach() for name, weight in self.critic.named_parameters()}
         value = _mean(functional_call(self.critic, frozen, (z, chosen)))
         size = value.abs().mean().detach() if self.settings.normalise_q else 1.0

@@ -4,18 +4,18 @@
     value     min  |expectile - 1(u < 0)| u^2,   u = min_i Q'_i(z, a) - V(z)
     actor     max  min(exp(temperature u), 100) log pi(a | z)
 
-No action is asked for that the data lacks: V is an expectile of the values of the actions taken, and the actor clones
-those that are better. pi is a Gaussian around the policy's action, with one learnt standard deviation for each
-dimension of an action; the policy that is kept is its mean. The actor's learning rate falls to 0 along a cosine.
+Q is never evaluated at actions outside the data: V is an expectile over the data's actions, and the actor clones the
+better ones. pi is a Gaussian around the policy's action with one learnt standard deviation per action dimension; the
+saved policy is its mean. The actor's learning rate follows a cosine to 0.
 
-Authors' code: github.com/ikostrikov/implicit_q_learning, as it is for locomotion.
+Authors' code: github.com/ikostrikov/implicit_q_learning, in its locomotion setting.
 
-Differences: states are frozen representations, standardised; returns are n-step. The critics step first, since theirs
-is the loss that trains an encoder: the authors' cycle (value, actor, critics, targets) is entered at the critics, so
-that V(z') has learnt from the batches before only. Rewards are as stored: the authors multiply those of locomotion
-so that the returns of a set span 1000. Those of trained actors' sets here span 88 (cheetah_run `expert`) to
-946 (walker_walk `medium_expert`): to scale them would be to multiply the temperature by 11 to 1. Initial weights are
-PyTorch's (theirs: orthogonal).
+Differences: states are frozen representations, standardised; returns are n-step. The critics step first, because an
+encoder is trained by the first loss: the authors' cycle (value, actor, critics, targets) starts at the critics, so
+V(z') has only learnt from earlier batches. Rewards are not scaled: the authors scale locomotion rewards so that a
+dataset's returns span 1000. The trained actors' datasets here span 88 (cheetah_run `expert`) to 946 (walker_walk
+`medium_expert`), so scaling would multiply the temperature by 11 to 1. Initial weights are PyTorch's (theirs:
+orthogonal).
 """
 
 from __future__ import annotations
@@ -48,15 +48,16 @@ class IQLOptions(ReturnOptions):
     """Options of IQL."""
 
     expectile: float = 0.7
-    """IQL's expectile, from 0 to 1: 0.5 values a state by the mean of its actions, more by the better ones."""
+    """IQL's expectile, from 0 to 1: at 0.5 V is the mean over actions; larger values move it towards the best
+    actions."""
     temperature: float = 3.0
-    """IQL's inverse temperature beta: an action is cloned by the weight exp(beta advantage)."""
+    """IQL's inverse temperature beta: actions are cloned with weight exp(beta * advantage)."""
 
     limits: ClassVar[Limits] = {"expectile": (0, 1), "temperature": 0}
 
 
 class Gaussian(nn.Module):
-    """Normal distribution around an action, of learnt standard deviations that depend on no state."""
+    """Gaussian around an action, with learnt, state-independent standard deviations."""
 
     def __init__(self, action_dim: int) -> None:
         super().__init__()
@@ -65,7 +66,7 @@ class Gaussian(nn.Module):
     def forward(self, mean: Tensor, action: Tensor) -> Tensor:
         """Log-likelihoods of actions: (B, A), (B, A) -> (B,)."""
         std = self.log_std.clamp(*LOG_STD_RANGE).exp()
-        # validation would read values, and so wait for the GPU in every update
+        # validation reads values, which would sync the GPU in every update
         return torch.distributions.Normal(mean, std, validate_args=False).log_prob(action).sum(-1)
 
 
@@ -92,10 +93,10 @@ class IQL(Algorithm):
         self.value_optimiser = Adam(self.value.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """A step of the critics and their targets, then of the value, then of the actor."""
+        """One step of the critics and their targets, then of the value, then of the actor."""
         critic = self.minimise(self.critic_loss, batch, along=(self.critic_optimiser, *encoder))
         move_target(self.target_critic, self.critic, self.tau)
-        q = self.each(self.target_value, batch)  # once, because two losses read it
+        q = self.each(self.target_value, batch)  # once, for both losses
         value = self.minimise(self.value_loss, batch, q, along=(self.value_optimiser,))
         set_learning_rate(self.policy_optimiser, self.policy_learning_rate)
         actor = self.minimise(self.actor_loss, batch, q, along=(self.policy_optimiser,))
@@ -104,29 +105,29 @@ class IQL(Algorithm):
 
     @torch.no_grad()
     def target_value(self, batch: FeatureBatch) -> Tensor:
-        """The (B,) smaller target value of the actions taken."""
+        """Smaller target value (B,) of the data's actions."""
         return torch.minimum(*self.target_critic(self.policy.standardise(batch.z), batch.action))
 
     def critic_loss(self, batch: FeatureBatch) -> Loss:
-        """Squared error of both critics, to the same target y."""
+        """Squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
-            # V of the next state, not Q of an action that the policy chose there: nothing unseen is evaluated
+            # V(z') instead of Q at the policy's action: no action outside the data is evaluated
             target = batch.reward + self.settings.gamma * batch.discount * self.value(next_z)[:, 0]
         return self.critic.loss(z, batch.action, target)
 
     def value_loss(self, batch: FeatureBatch, q: Tensor) -> Loss:
-        """Expectile loss of V to the (B,) smaller target value of the actions taken."""
+        """Expectile loss of V to the (B,) smaller target value of the data's actions."""
         value = self.value(self.policy.standardise(batch.z.detach()))[:, 0]
         loss = expectile_loss(q - value, self.settings.expectile)
         return Loss(loss, {"value_loss": loss.detach(), "v": value.detach().mean()})
 
     def actor_loss(self, batch: FeatureBatch, q: Tensor) -> Loss:
-        """Minus the likelihood of the actions taken, each weighted by its advantage."""
+        """Negative log-likelihood of the data's actions, weighted by exponentiated advantage."""
         z, action = self.policy.standardise(batch.z.detach()), batch.action
         with torch.no_grad():
             advantage = q - self.value(z)[:, 0]
-            # clipped: else the one transition that an untrained V underrates most decides the whole batch's gradient
+            # clipped, or one transition underrated by an untrained V would dominate the gradient
             weight = (self.settings.temperature * advantage).exp().clamp(max=MOST_WEIGHT)
         chosen = self.policy.from_standardised(z)
         loss = -(weight * self.gaussian(chosen, action)).mean()
@@ -135,12 +136,12 @@ class IQL(Algorithm):
 
     @property
     def policy_learning_rate(self) -> float | Tensor:
-        """Learning rate of the actor, which falls to 0 along a cosine."""
+        """Learning rate of the actor: cosine decay to 0."""
         done = share_of(self.updates, self.planned)
         cosine = torch.cos(math.pi * done) if isinstance(done, Tensor) else math.cos(math.pi * done)
         return self.learning_rate * (1 + cosine) / 2
 
 
 def expectile_loss(error: Tensor, expectile: float) -> Tensor:
-    """Mean of |expectile - 1(u < 0)| u^2 over errors u: (B,) -> scalar; for 0.5 half the mean squared error."""
+    """Mean of |expectile - 1(u < 0)| u^2 over errors u: (B,) -> scalar. At 0.5, half the mean squared error."""
     return ((expectile - (error < 0).float()).abs() * error.square()).mean()

@@ -3,15 +3,15 @@
     critics   y = r + gamma d (min_i Q'_i(z', a~) - beta_2 |a~ - a'|^2),   a~ = pi'(z') + clipped noise
     actor     max  Q_1(z, pi(z)) / mean |Q_1| - beta_1 (pi(z) - a)^2
 
-TD3+BC whose target, too, is charged for leaving the data: a' is the action that the set has at z'. Critics have three
+TD3+BC with a second penalty for leaving the data, in the target; a' is the dataset's action at z'. Critics have three
 hidden layers, each followed by LayerNorm. This is the authors' version for V-D4RL's pixels.
 
 Authors' code: github.com/DT6A/ReBRAC (src/algorithms/rebrac_torch_vis.py).
 
-Differences: states are frozen representations, standardised, and go straight into the networks: the authors' actor and
-critics each begin with a trunk (Linear, LayerNorm, Tanh), with which memoryless encoders here end. The actor has two
-hidden layers as that of every algorithm here (theirs: three). Initial weights are PyTorch's (theirs: orthogonal). The
-n-step return is cut short at an episode's end, where they leave transitions of fewer steps out.
+Differences: states are frozen representations, standardised, and go straight into the networks. The authors' actor and
+critics each begin with a trunk (Linear, LayerNorm, Tanh); here memoryless encoders end with one. The actor has two
+hidden layers, as in every algorithm here (theirs: three). Initial weights are PyTorch's (theirs: orthogonal). n-step
+returns are truncated at an episode's end; the authors drop those transitions.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class ReBRACOptions(ReturnOptions):
     """Options of ReBRAC; the defaults are the authors' for walker_walk `medium_expert`."""
 
     actor_bc: float = 0.3
-    """ReBRAC's beta_1: weight of behaviour cloning against the normalised critic."""
+    """ReBRAC's beta_1: weight of behaviour cloning relative to the normalised critic."""
     critic_bc: float = 0.005
-    """ReBRAC's beta_2: what the target value pays for the squared distance of its action from the set's."""
+    """ReBRAC's beta_2: penalty in the target value on the squared distance between its action and the dataset's."""
 
     critic_layers: int = 3
     """Hidden layers of each critic."""
@@ -49,11 +49,11 @@ class ReBRACOptions(ReturnOptions):
 
 
 class NormedCritics(TwinCritic):
-    """Two independent Q functions with LayerNorm behind every hidden layer: (B, D), (B, A) -> two (B,)."""
+    """Two independent Q functions with LayerNorm after every hidden layer: (B, D), (B, A) -> two (B,)."""
 
     def __init__(self, dim: int, action_dim: int, hidden: int, layers: int, kind: nn.Module, eps: float) -> None:
-        """`kind` is the nonlinearity, `eps` LayerNorm's."""
-        nn.Module.__init__(self)  # in place of the other's networks
+        """`kind` is the activation; `eps` is LayerNorm's."""
+        nn.Module.__init__(self)  # skips TwinCritic's networks
 
         def network() -> nn.Sequential:
             modules: list[nn.Module] = []
@@ -74,20 +74,20 @@ class ReBRAC(TD3BC):
         self, policy: Policy, options: ReBRACOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
-        # in place of TD3+BC's, which are drawn before: weights of the same seed stay those of the published rows
+        # replaces TD3+BC's critics, which are still drawn first so that seeds give the weights of the published rows
         critic = NormedCritics(**policy.shape, layers=options.critic_layers, kind=nn.ReLU(), eps=1e-5)
         self.critic = critic.to(policy.standardise.mean.device)
         self.target_critic = copy.deepcopy(self.critic)
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
 
     def _next_value(self, batch: FeatureBatch, next_z: Tensor, chosen: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The smaller value, less what leaving the data costs."""
+        """The smaller value, minus the penalty for leaving the data."""
         value, _ = super()._next_value(batch, next_z, chosen)
         away = (chosen - batch.next_action).square().sum(-1)
         return value - self.settings.critic_bc * away, {"next_bc_loss": away.mean()}
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
-        """Weighted cloning less the value, in units of the value's own size."""
+        """Weighted cloning minus the value, normalised by mean |Q|."""
         z = self.policy.standardise(batch.z.detach())
         chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)

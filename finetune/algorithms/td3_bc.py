@@ -36,7 +36,7 @@ class TD3BCOptions(ReturnOptions):
     """Options of TD3+BC."""
 
     alpha: float = 2.5
-    """Weight of the critic against behaviour cloning."""
+    """Weight of the critic relative to behaviour cloning."""
 
     limits: ClassVar[Limits] = {"alpha": 0}
 
@@ -55,7 +55,7 @@ class TwinCritic(nn.Module):
         return self.first(both)[:, 0], self.second(both)[:, 0]
 
     def loss(self, z: Tensor, action: Tensor, target: Tensor) -> Loss:
-        """Sum of both values' squared errors to one (B,) target; it logs the first value's mean as `q`."""
+        """Sum of both critics' mean squared errors to one (B,) target. Logs the first critic's mean value as `q`."""
         first, second = self(z, action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
         return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
@@ -68,7 +68,7 @@ class TD3BC(Algorithm):
     summary = "TD3 with a behaviour cloning term"
     tau = 0.005
     period = 2
-    """Updates of the critics to one of the actor."""
+    """Critic updates per actor update."""
 
     def __init__(
         self, policy: Policy, options: ReturnOptions, learning_rate: float, updates: int, draws: RandomStream
@@ -82,18 +82,18 @@ class TD3BC(Algorithm):
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """A step of the critics, and in the last update of a `period` one of the actor and of the targets."""
+        """One step of the critics; in the last update of a `period`, also of the actor and the targets."""
         optimisers = (self.critic_optimiser, *encoder)
         logs = self.minimise(self.critic_loss, batch, self.next_noise(batch), along=optimisers)
         if self.turn == self.period - 1:
             drawn = self.actor_noise(batch)
             logs |= self.minimise(self.actor_loss, batch, *drawn, along=(self.policy_optimiser,))
             self.move_targets()
-        self.updates += 1  # last, because DrQ-v2's noise of both losses is that of the updates made before
+        self.updates += 1  # last: DrQ-v2's noise schedule uses the number of previous updates for both losses
         return logs
 
     def next_noise(self, batch: FeatureBatch) -> Tensor:
-        """Noise for the next actions: similar actions have similar values, so a lone peak of the critic is averaged."""
+        """Target policy smoothing: noise on the next actions averages out narrow peaks of the critic."""
         return (self.draws.normal(*batch.action.shape) * TARGET_NOISE).clamp(-NOISE_CLIP, NOISE_CLIP)
 
     def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:
@@ -101,29 +101,29 @@ class TD3BC(Algorithm):
         return ()
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Squared error of both critics, to the same target y."""
+        """Squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value, logs = self._next_value(batch, next_z, self._next_action(next_z, noise))
-            # `discount` is 0 if the task itself ended within the n steps; a time limit ends nothing, so it bootstraps
+            # `discount` is 0 if the task ended within the n steps; time limits still bootstrap
             target = batch.reward + self.settings.gamma * batch.discount * value
         loss = self.critic.loss(z, batch.action, target)
         return Loss(loss.value, loss.logs | logs)
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
-        """Cloning less the value, in units of the value's own size."""
-        z = self.policy.standardise(batch.z.detach())  # the critics' loss alone trains an encoder
+        """Cloning minus the value, normalised by mean |Q|."""
+        z = self.policy.standardise(batch.z.detach())  # an encoder is trained by the critics' loss only
         chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)
-        # one alpha for tasks of any reward; a number, because shrinking |Q| is no way to a better policy
+        # normalising lets one alpha fit any reward scale; detached, or the actor could shrink |Q| instead
         weight = self.settings.alpha / value.abs().mean().detach()
         cloning = F.mse_loss(chosen, batch.action)
         loss = cloning - weight * value.mean()
         return Loss(loss, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
 
     def _next_value(self, batch: FeatureBatch, next_z: Tensor, chosen: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """What the target bootstraps from at the next actions (B, A), (B,), and what there is to log of it."""
-        # the smaller of two: the policy seeks out what a critic overrates, and no new data would correct it
+        """Bootstrap value (B,) of the next actions (B, A), and scalars to log."""
+        # minimum of two critics, since the policy exploits overestimation that no new data corrects
         return torch.minimum(*self.target_critic(next_z, chosen)), {}
 
     def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:
@@ -131,14 +131,14 @@ class TD3BC(Algorithm):
         return (self.target_policy.from_standardised(next_z) + noise).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
-        """What the actor maximises."""
+        """Value that the actor maximises."""
         return self.critic.first(torch.cat([z, action], dim=-1))
 
     def _policy_action(self, z: Tensor, *noise: Tensor) -> Tensor:
-        """The action that the actor's loss is about."""
+        """Action in the actor's loss."""
         return self.policy.from_standardised(z)
 
     def move_targets(self) -> None:
-        """Move the target networks by the share tau of the way."""
+        """Move the target networks by the fraction tau."""
         move_target(self.target_critic, self.critic, self.tau)
         move_target(self.target_policy.net, self.policy.net, self.tau)

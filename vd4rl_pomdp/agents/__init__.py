@@ -1,10 +1,10 @@
-"""An agent, encoder and policy, and its folder: both in half precision, and a card that says what it returns.
+"""Agents: an encoder and a policy in one folder, in half precision, with a card that reports their returns.
 
     FOLDER/  encoder/  policy/  card.json
 
-The card tells task, quality and fingerprint of the set, corruption, method, algorithm, seed, budget, the run's id and
-commit, the episodes of the rounded weights, what drew and computed them (digits are the same where renderer and kind of
-processor are), and the SHA-256 of the other files. What ships lies below this package's folder: its place is its name.
+The card holds the data set's task, quality and fingerprint, the corruption, method, algorithm, seed, budget, run id and
+commit, the episodes played with the rounded weights and on which renderer and processor (only the same ones reproduce
+all digits), and the SHA-256 of the other files. Shipped agents are named by their path below this package's folder.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes
 
 CARD = "card.json"
 FILES = tuple(f"{part}/{name}" for part in ("encoder", "policy") for name in ("config.json", "model.safetensors"))
-"""An agent's files beside its card."""
+"""An agent's files other than its card."""
 SHIPPED = Path(__file__).parent
 
 
 class Agent:
-    """Encoder and policy, fed one row at a time; its own past actions are part of the history."""
+    """Encoder and policy that act one row at a time; the agent remembers the history, its own actions included."""
 
     def __init__(self, encoder: Encoder, policy: Policy, card: dict[str, Any] | None = None) -> None:
         self.encoder, self.policy, self.card = encoder, policy, card or {}
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: an episode begins."""
+        """Clear the history at the start of an episode."""
         self._state = self.encoder.initial_state(1)
-        self._action = torch.zeros(1, self.encoder.config.action_dim)  # what first rows carry in training
+        self._action = torch.zeros(1, self.encoder.config.action_dim)  # as at first rows in training
 
     @property
     def picture_size(self) -> int:
-        """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
+        """Image size to render at: the encoder's, or the benchmark's frame size (for videos) if it reads states."""
         return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
 
     def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
-        """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
+        """The encoder's input: the corrupted stack, or the simulator state for the `state` reference."""
         if not isinstance(self.encoder.frame, StateFrame):
             return now.obs
         state = torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))
@@ -61,28 +61,28 @@ class Agent:
     @torch.no_grad()
     def act(self, obs: torch.Tensor | np.ndarray) -> np.ndarray:
         """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
-        # one row at a time is all that an environment gives; training read the same states from whole windows
+        # step() gives the same states that training computed with encode() on whole windows
         z, self._state = self.encoder.step(torch.as_tensor(obs)[None], self._action, self._state)
         self._action = self.policy(z)
         return self._action[0].numpy()
 
     def set_last_action(self, action: np.ndarray) -> None:
-        """Tell that another (A,) action than the last answer was executed."""
+        """Replace the last action in the history, if the executed (A,) action was not the one `act` returned."""
         self._action = torch.from_numpy(action)[None]
 
 
 def load_agent(name: Path | str) -> Agent:
-    """An agent that ships, by name, or one's own from its folder, at the beginning of an episode.
+    """Load a shipped agent by name, or any agent by folder; it is ready for a new episode.
 
     Raises:
-        UserError: there is none, or its files are damaged.
+        UserError: there is no such agent, or its files are damaged.
     """
     folder, card = find_agent(name)
     return Agent(load_encoder(folder / "encoder", card["task"])[0], load_policy(folder / "policy"), card)
 
 
 def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
-    """Folder and card of an agent, its files checked; raises as `load_agent` does."""
+    """Folder and card of an agent, after checking its files' SHA-256; errors as `load_agent`."""
     folder = next((place for place in (SHIPPED / name, Path(name)) if (place / CARD).exists()), None)
     if folder is None:
         raise UserError(
@@ -97,7 +97,7 @@ def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
 
 
 def shipped() -> list[str]:
-    """Names of the agents that ship."""
+    """Names of the shipped agents."""
     return sorted(card.parent.relative_to(SHIPPED).as_posix() for card in SHIPPED.rglob(CARD))
 
 
@@ -108,10 +108,10 @@ def checksums(folder: Path) -> dict[str, str]:
 
 
 def write_rounded(run: Path, folder: Path) -> None:
-    """Write a run's encoder and policy in half precision, which is all the rounding that there is: loaded as float32.
+    """Write a run's encoder and policy with weights rounded to float16; they are loaded and computed as float32.
 
     Raises:
-        UserError: a file is missing or damaged, a weight is too large, or the folder cannot be written.
+        UserError: a file is missing or damaged, a weight overflows float16, or the folder cannot be written.
     """
     for name in FILES:
         with disk_errors(folder):

@@ -1,8 +1,8 @@
-"""Ground of the house: the time axis, errors, named random streams, parts and their options."""
+"""Foundations that everything else imports: the time axis, errors, random streams, plug-in registries and options."""
 
 from importlib.metadata import PackageNotFoundError, version
 
 try:
     __version__ = version("vd4rl-pomdp")
-except PackageNotFoundError:  # a source tree that was never installed
+except PackageNotFoundError:  # running from a source tree that is not installed
     __version__ = "0+unknown"

@@ -1,6 +1,6 @@
-"""Memory on the CPU: what numpy may work on in torch's place, and blocks for batches of frames that are used again.
+"""Reusable CPU memory for batches of frames, and the check whether numpy may work on a tensor directly.
 
-Fresh pages for every batch cost more time than filling them.
+Page-faulting fresh memory for every batch costs more time than filling it.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ import torch
 from torch import Tensor
 
 _KEPT = 4
-"""Blocks kept at most: two for a batch of transitions, twice."""
+"""Maximum number of blocks: two per batch of transitions (obs and next_obs), for two batches."""
 
 
 def in_host_memory(x: Tensor) -> bool:
-    """Whether numpy may read and write a tensor, and Python decide by its values, without waiting for a GPU.
+    """Whether numpy and Python may read a tensor's values without a GPU sync.
 
-    Both ways give the same numbers: the one for CPUs is faster there, the other can be replayed.
+    Callers have two code paths with equal results: a faster one for the CPU, and one that CUDA graphs can capture.
     """
     return x.device.type == "cpu"
 
 
 class FrameBuffers:
-    """Lends blocks of CPU memory; a block is lent again once no tensor uses it any more."""
+    """Lends blocks of CPU memory; a block is reused once no tensor refers to it."""
 
     def __init__(self) -> None:
         self._blocks: list[tuple[np.ndarray, weakref.ref[np.ndarray]]] = []
-        """Each block with the view that its borrower holds, gone when the last tensor on it is gone."""
+        """Each block with a weak reference to the view lent out, which dies with the last tensor that uses it."""
         self._lock = threading.Lock()
 
     def take(self, shape: tuple[int, ...] | torch.Size) -> Tensor:
-        """Uninitialised uint8 tensor of a shape that shares memory with no other living tensor."""
+        """Uninitialised uint8 tensor that shares memory with no other live tensor."""
         shape = tuple(shape)
         with self._lock:
             idle = [i for i, (_, view) in enumerate(self._blocks) if view() is None]
@@ -50,4 +50,4 @@ class FrameBuffers:
 
 
 BUFFERS = FrameBuffers()
-"""The process's only lender."""
+"""The only instance in a process."""

@@ -1,4 +1,4 @@
-"""Functions that torch compiles on a GPU, where many small kernels become a few; a CPU runs them as written."""
+"""torch.compile for functions on a GPU, where it fuses many small kernels; on the CPU they run eagerly."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vd4rl_pomdp.core.errors import first_line
 
 
 def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that is compiled where one of its arguments is a tensor on a GPU.
+    """Decorator that compiles a function when one of its arguments is a CUDA tensor.
 
-    Where that fails, for want of a C compiler or whatever reason, one line says so, and it runs as it is written, which
-    is its attribute `__wrapped__`. `TORCH_COMPILE_DISABLE=1` in the environment turns compiling off.
+    If compilation fails, e.g. without a C compiler, it warns once and runs the original function, available as
+    `__wrapped__`. `TORCH_COMPILE_DISABLE=1` in the environment turns compilation off.
 
     Args:
-        training: only where gradients are wanted: elsewhere sizes vary, and compiling takes longer than it saves.
+        training: compile only when gradients are enabled. Elsewhere shapes vary, so compilation does not pay off.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -34,15 +34,15 @@ def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], An
                 return function(*args)
             try:
                 if compiled is None:
-                    from torch._functorch import config  # only here: it takes seconds to import what compiles
+                    from torch._functorch import config  # imported here: loading the compiler takes seconds
 
-                    config.donated_buffer = False  # or a loss could not keep its graph for a second gradient
+                    config.donated_buffer = False  # else `retain_graph=True` fails
                     compiled = torch.compile(function)
                 return compiled(*args)
             except torch.OutOfMemoryError:
                 raise
             except Exception as error:
-                out = function(*args)  # what is wrong with the arguments is raised here
+                out = function(*args)  # raises if the arguments were at fault
                 failed = True
                 line = f"warning: {function.__qualname__} is not compiled, which is slower: {first_line(error)}"
                 print(line, file=sys.stderr, flush=True)

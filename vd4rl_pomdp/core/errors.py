@@ -1,7 +1,7 @@
-"""The one exception that a user may see, and checks that raise it.
+"""The exceptions that users may see, and checks that raise them.
 
-A function's first word says when it raises UserError: `check_x` unless x is valid, `require_x` unless there is enough
-of x (memory, disk, rows), `refuse_x` for something named x that cannot be accepted. None of them changes anything.
+Naming: `check_x` raises UserError unless x is valid, `require_x` unless there is enough of x (memory, disk, rows), and
+`refuse_x` if something is an x that cannot be accepted. None of them changes anything.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from stat import S_ISDIR
 from typing import Any
 
 TEMPORARY = 75
-"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again. It sees no
-more of a job than this code, and bad input, 2, would be refused every time."""
+"""Exit code of failures that a retry may fix, EX_TEMPFAIL of sysexits.h. A sweep sees only a job's exit code: it
+retries after 75, but not after 2 (bad input)."""
 
 
 class UserError(ValueError):
-    """Bad input: the message is one line that says what is wrong, where, and what to do.
+    """Bad input: a one-line message with what is wrong, where, and what to do.
 
-    The command line prints the message and exits with code 2; a library caller catches a ValueError.
+    The command line prints it and exits with code 2; library users can catch ValueError.
     """
 
     code = 2
@@ -31,21 +31,21 @@ class UserError(ValueError):
 
 
 class OutOfMemoryError(UserError):
-    """The memory of the machine or its GPU did not suffice."""
+    """The machine or its GPU ran out of memory."""
 
 
 class UnavailableError(UserError):
-    """The system could not do now what it may do later: a disk that does not answer, too many open files."""
+    """The system failed in a way that may pass: a disk that does not answer, too many open files."""
 
     code = TEMPORARY
 
 
 class DiskFullError(UnavailableError):
-    """No space was left where something was to be written."""
+    """The disk is full."""
 
 
 class WorkerDiedError(UserError):
-    """A process that helped was ended from outside."""
+    """A worker process was killed from outside."""
 
     code = TEMPORARY
 
@@ -55,19 +55,19 @@ _PASSING = (
     *(errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH),
     *(errno.ECONNREFUSED, errno.ECONNRESET),
 )
-"""What a network file system or a busy machine answers for a while."""
+"""Transient errors of network file systems and busy machines."""
 _OF_CONTENT = (None, errno.EINVAL, errno.ENOENT, errno.ENOTDIR)
-"""What a library's error carries that read what is not there, or followed an offset that a damaged file names."""
+"""Error numbers that point at a file's content: libraries report them for missing data or offsets in a damaged file."""
 MAX_SEED = 2**31 - 1
-"""Largest seed that every random generator in use takes."""
+"""Largest seed that all random generators accept."""
 MOST = 10**9
-"""Largest number that any flag takes, unless it says otherwise."""
+"""Default upper limit of numeric flags."""
 MOST_ROWS = 2**20
-"""Most rows of an episode: the keys of more would be another's."""
+"""Maximum rows per episode; more would overflow into the next episode's row keys."""
 
 
 def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
-    """Refuse fields of a config outside their range: lowest, or lowest and highest; None passes."""
+    """Raise UserError for config fields outside `low` or `(low, high)`; None is allowed."""
     for name, limits in ranges.items():
         if (value := getattr(config, name)) is not None:
             refuse_number(name, value, *(limits if isinstance(limits, tuple) else (limits,)))
@@ -80,7 +80,7 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
 
 
 def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
-    """Two numbers as a message shows them: rounded to `decimals`, or to the fewest more that show which is larger."""
+    """Format two numbers for a message with just enough decimals, at least `decimals`, to show which is larger."""
 
     def shown(number: float) -> str:
         return f"{number:,.{decimals}f}"
@@ -91,39 +91,39 @@ def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
 
 
 OR_ONES_OWN = ", or run or import the file that registers it"
-"""What else to do about an unknown name of a kind that parts of one's own can be of."""
+"""Extra advice for an unknown name of a kind that users can register themselves."""
 
 
 def refuse_unknown(kind: str, name: object, choices: Iterable[object], remedy: str = "") -> None:
-    """Raise UserError for a name that is none of the choices.
+    """Raise UserError for a name that is not among the choices.
 
     Args:
-        kind: what the name is of.
+        kind: what is named, e.g. "method".
         name: the name.
-        choices: what is listed.
-        remedy: what else may be done.
+        choices: valid names.
+        remedy: further advice, appended to the message.
     """
     if name not in (known := list(choices)):
         raise UserError(f"unknown {kind} {name!r}: choose one of {', '.join(map(str, known))}{remedy}")
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says first; its kind if it says nothing."""
+    """First line of an error's message, or its class name if there is none."""
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def in_one_line(error: BaseException) -> str:
-    """All that an error says, line breaks and indentation as single blanks; nothing if it says nothing."""
+    """An error's message on one line, with whitespace collapsed; "" if there is none."""
     return " ".join(str(error).split())
 
 
 def flag_of(name: str) -> str:
-    """The flag that sets a config's field."""
+    """The flag of a config field: "max_k" -> "--max-k"."""
     return f"--{name.replace('_', '-')}"
 
 
 def refuse_no_folder(path: Path) -> None:
-    """Raise UserError unless `path` is a folder or can become one, before the work whose result goes there."""
+    """Raise UserError unless `path` is or can become a folder. Called before work whose result goes there."""
     for place in (path, *path.parents):
         try:
             mode = place.stat().st_mode
@@ -139,7 +139,7 @@ def refuse_no_folder(path: Path) -> None:
 
 
 def disk_error(path: Path | str | None, error: OSError) -> UserError:
-    """A sentence for a file or folder that could not be read or written; None where the system does not name it."""
+    """UserError for a file or folder that could not be read or written; `path` is None if the system names none."""
     where = f"{path}: " if path is not None else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFullError(f"{where}the disk is full: free some space and re-run the same command")
@@ -154,9 +154,9 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
 
 
 def system_error(path: Path, error: Exception) -> UserError | None:
-    """What the system refused to a library that opened or read a file itself; None if the file's content is at fault.
+    """UserError for an OS error behind a library's exception; None if the file's content is at fault.
 
-    HDF5 tells the system's number within its sentence, which is all that there is where h5py makes it a KeyError.
+    HDF5 puts the errno into its message text, and h5py may even turn it into a KeyError.
     """
     told = re.search(r"\berrno = (\d+)", str(error))
     number = int(told[1]) if told else getattr(error, "errno", None)
@@ -165,7 +165,7 @@ def system_error(path: Path, error: Exception) -> UserError | None:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError within the block into one sentence about `path`."""
+    """Turn an OSError within the block into a UserError about `path`."""
     try:
         yield
     except OSError as error:

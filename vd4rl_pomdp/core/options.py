@@ -1,7 +1,7 @@
-"""Settings of a stage: its own, and the options of the parts that were chosen by name.
+"""Settings of a stage: its own, and the options of the plug-ins chosen by name.
 
-Every method, corruption, fine-tuning algorithm and frame encoder names a dataclass of its options. In Python they are
-nested in the stage's config; on the command line and in records all settings stand in one list by their names.
+Every method, corruption, algorithm and frame encoder has a dataclass of options. In Python these are nested in the
+stage's config; on the command line and in records all settings form one flat list.
 """
 
 from __future__ import annotations
@@ -27,35 +27,36 @@ RUNTIME_FIELDS = frozenset(
         "checkpoint_every",
     }
 )
-"""Config fields that do not change a result, so that a run may go on with other values; data and encoder may be moved,
-and are compared by content; `eval_clean` and the number of its episodes add rows that change no other."""
+"""Config fields that do not affect results, so a run may resume with other values. `data` and `encoder` may move, since
+they are compared by content. `eval_clean` and `eval_clean_episodes` only add rows."""
 NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
-"""Config fields in which the seeds of one experiment may differ."""
+"""Config fields that may differ between the seeds of one experiment."""
 
 LATER = {"future_frames": "all", "view_seed": None, "keep_newest": False, "hold_out": False}
-"""Settings that earlier versions did not record, with what they did: having this value is the same as not having it."""
+"""Settings that earlier versions did not record, with the value they implied: this value counts as absent."""
 
 LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
-"""What names the rows of a run."""
+"""Columns that identify a run's rows."""
 
 Limits = Mapping[str, float | tuple[float, float]]
-"""Lowest, or lowest and highest, value of numbers by name."""
+"""By name, a number's minimum, or minimum and maximum."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a part that has none. Subclasses add fields with a default and a docstring, which become flags."""
+    """Options of a plug-in; this base class has none. Fields of subclasses need a default and a docstring and become
+    flags."""
 
     limits: ClassVar[Limits] = {}
-    """What the numbers among a class's own fields may be."""
+    """Valid ranges of the class's own numeric fields."""
 
     @classmethod
     def fill(cls, values: Mapping[str, Any]) -> Self:
-        """Options with those of many values that they have a field for, and their own defaults."""
+        """Options from the entries of `values` that match a field, and defaults for the rest."""
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
     def check(self) -> None:
-        """Raise UserError for a number out of range, here or in options within."""
+        """Raise UserError for a number out of range, here or in nested options."""
         for kind in type(self).__mro__:
             refuse_outside(self, **vars(kind).get("limits", {}))
         _check_options(self)
@@ -66,31 +67,31 @@ NO_OPTIONS = Options()
 
 @dataclass(frozen=True, kw_only=True)
 class StageConfig:
-    """Settings of a stage; `of` makes them from names and values."""
+    """Settings of a stage; build one with `of`."""
 
     preset: str = "paper"
-    """paper, cpu or smoke: the defaults of all other settings."""
+    """paper, cpu or smoke: sets the defaults of all other settings."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {}}
-    """Values by setting, by preset; an option is taken where the chosen parts have it."""
+    """Values by setting for each preset. Values for options that the chosen plug-ins lack are ignored."""
     choosers: ClassVar[tuple[str, ...]] = ()
-    """Settings that choose parts, and with them which options there are."""
+    """Settings that choose plug-ins and thereby decide which options exist."""
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of the chosen parts, by the field that holds them, taking what `values` has for them."""
+        """Options of the chosen plug-ins by the field that holds them, filled from `values`."""
         return {}
 
     @classmethod
     def of(cls, preset: str = "paper", **settings: Any) -> Self:
-        """Settings of the stage.
+        """Build a stage's settings from names and values.
 
         Args:
-            preset: what decides the defaults.
-            settings: values by name, of the stage's own settings and of the chosen parts' options.
+            preset: sets the defaults.
+            settings: values by name, for the stage's own settings and for the chosen plug-ins' options.
 
         Raises:
-            UserError: an unknown preset or part, a setting that nothing reads, or one that two parts have.
+            UserError: an unknown preset or plug-in, a setting that nothing reads, or one defined twice.
         """
         values = cls.defaults(preset) | settings
         parts = cls.parts(values)
@@ -104,41 +105,42 @@ class StageConfig:
 
     @classmethod
     def defaults(cls, preset: str) -> dict[str, Any]:
-        """Default values of a preset: the stage's own, and those that it has for options of parts."""
+        """Defaults of a preset, for the stage's own settings and for plug-in options."""
         refuse_unknown("preset", preset, cls.presets)
         return flat(cls()) | dict(cls.presets[preset]) | {"preset": preset}
 
     def check(self) -> None:
-        """Refuse settings that cannot work, before anything is read or written."""
+        """Raise UserError for invalid settings, before anything is read or written."""
         _check_options(self)
 
     def altered(self, **changes: Any) -> Self:
-        """The same with other settings, perhaps other parts; what differs from the preset's defaults is kept.
+        """A copy with other settings or plug-ins. Settings that differ from the preset's defaults are kept.
 
         Raises:
-            UserError: a setting that was not the default is not read by what is now chosen.
+            UserError: a non-default setting is not read by the newly chosen plug-ins.
         """
         usual = self.usual()
         told = {name: value for name, value in flat(self).items() if value != usual.get(name)}
         return type(self).of(**({"preset": self.preset} | self._chosen() | told | changes))
 
     def with_known(self, **settings: Any) -> Self:
-        """The same with those of some settings that it has: sizes, say, for whatever parts are chosen."""
+        """A copy with those of the given settings that exist here. Useful to shrink sizes, whatever plug-ins are
+        chosen."""
         known = flat(self)
         return self.altered(**{name: value for name, value in settings.items() if name in known})
 
     def usual(self) -> dict[str, Any]:
-        """What the settings would be if nothing had been chosen but preset and parts."""
+        """The settings if only preset and plug-ins had been chosen."""
         return flat(type(self).of(self.preset, **self._chosen()))
 
     def _chosen(self) -> dict[str, Any]:
-        """The parts, other than those that another part's options name."""
+        """The chosen plug-ins, except those named in another plug-in's options."""
         own = flat(type(self)())
         return {name: value for name, value in flat(self).items() if name in self.choosers and name in own}
 
 
 def options_in(value: Any) -> tuple[Options, ...] | None:
-    """The options that a field holds; None for a field that is a setting itself."""
+    """The options held by a field; None if the field is itself a setting."""
     if isinstance(value, Options):
         return (value,)
     return value if isinstance(value, tuple) and all(isinstance(part, Options) for part in value) else None
@@ -151,10 +153,10 @@ def _check_options(config: Any) -> None:
 
 
 def flat(config: Any) -> dict[str, Any]:
-    """All settings of a config by name, its options' included.
+    """All settings of a config by name, including nested options.
 
     Raises:
-        UserError: two of them have one name, so that one flag would set both, and a record hold one of them.
+        UserError: two settings share a name, so one flag would set both and a record could hold only one.
     """
     found: dict[str, Any] = {}
     owners: dict[str, str] = {}
@@ -179,16 +181,16 @@ def flat(config: Any) -> dict[str, Any]:
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage's config, as JSON keeps it, without NO_SETTINGS: the same for all seeds of an experiment.
+    """A stage's config in JSON form without NO_SETTINGS: equal for all seeds of one experiment.
 
-    Runs are seeds of one experiment only if their settings agree.
+    Runs with different settings are never treated as seeds of one experiment.
     """
     told = {name: value for name, value in config.items() if name not in NO_SETTINGS}
     return {name: value for name, value in told.items() if name not in LATER or value != LATER[name]}
 
 
 def words_of(settings: Mapping[str, Any]) -> list[str]:
-    """Settings as words of a command line."""
+    """Settings as command-line words: {"max_k": 3} -> ["--max-k", "3"]."""
     words: list[str] = []
     for name, value in settings.items():
         flag = flag_of(name)
@@ -200,11 +202,11 @@ def words_of(settings: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_options(kind: Any, base: type[Options] = Options) -> None:
-    """Raise UserError for what cannot be the class of a part's options.
+    """Raise UserError for an invalid options class.
 
     Args:
-        kind: what a part names as this class.
-        base: a class that it is, or is derived from.
+        kind: what a plug-in gives as its options class.
+        base: required base class.
     """
     if not (isinstance(kind, type) and issubclass(kind, base)):
         raise UserError(

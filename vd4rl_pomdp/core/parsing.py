@@ -1,4 +1,4 @@
-"""Words of a command line as settings, with one-line errors for bad ones."""
+"""Parses command-line words into settings, with one-line errors."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _TYRO = tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName
 
 
 def parse(config: Any, words: list[str], program: str, default: Any = None) -> Any:
-    """Words as an instance of a config class, or as what a function returns for them.
+    """Parse words into an instance of a config class, or call a function with them.
 
     Args:
         config: the class or function.
-        words: of a command line, behind the command.
-        program: what stands before them.
-        default: an instance that has the defaults.
+        words: command-line words after the command.
+        program: the words before them.
+        default: an instance that holds the defaults.
     """
     for before, word in zip(["", *words], words, strict=False):
-        # As a Path an empty word would be the working directory: `--out "$UNSET"` would write there.
+        # An empty word would parse as Path("."): `--out "$UNSET"` would write to the working directory.
         if not word or (word.startswith("--") and word.endswith("=")):
             name = word.rstrip("=") or (before if before.startswith("--") else "a word")
             raise UserError(f"{name} is empty: is a variable of the shell not set? (see `{program} --help`)")
@@ -51,14 +51,14 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
         raise UserError(f"{' '.join(text.split())} (see `{program} --help`)") from None
     told = parsed.keywords if isinstance(parsed, partial) else vars(parsed)
     for word, after in pairwise([*words, "--"]):
-        # a list may be empty for tyro, and `sweep run GRID --only $UNSET` would run everything
+        # tyro accepts an empty list, and `sweep run GRID --only $UNSET` would run everything
         if after.startswith("--") and told.get(word.removeprefix("--").replace("-", "_")) in ([], ()):
             raise UserError(f"{word} has no value: is a variable of the shell not set? (see `{program} --help`)")
     return parsed
 
 
 def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
-    """Parse a stage's config: preset, method and the like decide which flags there are, and their defaults."""
+    """Parse a stage's config. Preset, method and the like are read first: they decide the flags and their defaults."""
     chosen = chosen_by(words, (*config.choosers, *["preset"] * (len(config.presets) > 1)))
     required = {f.name: tyro.MISSING for f in fields(config) if f.default == Path()}
     parsed: Stage = parse(config, words, program, config.of(**chosen, **required))
@@ -67,7 +67,7 @@ def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
 
 
 def chosen_by(words: list[str], names: Iterable[str]) -> dict[str, str]:
-    """The values that a command line gives some flags."""
+    """Values of some flags on a command line."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
     for name in names:
         parser.add_argument(flag_of(name), f"--{name}", dest=name, nargs="?", const="")

@@ -1,4 +1,4 @@
-"""Read files that may hold anything: a damaged one ends in an error with a message, and no file makes a reader hang."""
+"""Read files without trusting their content: damage raises an error with a message, and no file makes a reader hang."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _PARSING = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, csv.Error, BadZipFile, zlib.error)
-"""What those who parse a damaged file raise."""
+"""Exceptions that parsers raise on damaged files."""
 
 
 def regular(path: Path) -> Path:
-    """`path` itself; raises UserError for a pipe or a device, which may have no end, and for a folder."""
+    """Return `path`; UserError for a folder, or for a pipe or device, which may never end."""
     if path.exists() and not path.is_file():
         raise UserError(f"{path}: is no regular file but a folder, a pipe or a device; remove it or name another")
     return path
 
 
 def read_bytes(path: Path) -> bytes:
-    """A file's content; raises FileNotFoundError for a missing file, UserError for one that cannot be read.
+    """A file's content; FileNotFoundError if it is missing, UserError if it cannot be read.
 
-    An error while its content is parsed then means that the file is damaged.
+    Any later error while parsing the content thus means that the file is damaged.
     """
     try:
         return regular(path).read_bytes()
@@ -46,7 +46,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """`json.loads`, with a ValueError for every failure."""
+    """`json.loads` that raises ValueError for every failure."""
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -55,7 +55,7 @@ def parse_json(text: str | bytes) -> Any:
 
 @contextmanager
 def damaged(where: Path | str, what: str, remedy: str = "") -> Iterator[None]:
-    """Within the block a file's content is read: whatever is wrong with it becomes "where: what (error); remedy"."""
+    """Turn parsing errors within the block into UserError "where: what (error); remedy"."""
     try:
         yield
     except UserError:
@@ -65,7 +65,7 @@ def damaged(where: Path | str, what: str, remedy: str = "") -> Iterator[None]:
 
 
 def build(kind: type[T], values: Any) -> T:
-    """An instance of a dataclass from JSON values; wrong names, or a value of another type, raise TypeError."""
+    """Build a dataclass from JSON values; TypeError for unknown names or wrong types."""
     made, hints = kind(**values), get_type_hints(kind)
     for field in fields(made):  # type: ignore[arg-type]
         if not fits(getattr(made, field.name), hints[field.name]):
@@ -74,7 +74,7 @@ def build(kind: type[T], values: Any) -> T:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of an annotated type: an int is a float, too, and a bool is no int."""
+    """Whether a value matches a type annotation. An int counts as float; a bool does not count as int."""
     if hint is Any:
         return True
     if get_origin(hint) in (Union, UnionType):
@@ -87,9 +87,9 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def safetensors_metadata(content: bytes) -> dict[str, str]:
-    """What stands in the header of a safetensors file besides its tensors; raises ValueError for no such file.
+    """Metadata in the header of a safetensors file; ValueError if it is not one.
 
-    The library tells it of files alone that it opens itself, and calls every one missing that it cannot open.
+    The library only reads metadata of files that it opens itself, and reports every one it cannot open as missing.
     """
     header = parse_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
     metadata = header.get("__metadata__", {}) if isinstance(header, dict) else None
@@ -99,10 +99,10 @@ def safetensors_metadata(content: bytes) -> dict[str, str]:
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Tensors of a safetensors file; a number that is not finite raises UserError.
+    """Tensors of a safetensors file; UserError if a number is not finite.
 
     Raises:
-        FileNotFoundError, SafetensorError: the file is missing or no such file.
+        FileNotFoundError, SafetensorError: the file is missing, or is no safetensors file.
     """
     import torch
     from safetensors.torch import load

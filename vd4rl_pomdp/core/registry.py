@@ -1,4 +1,4 @@
-"""Parts by name: the package's own, those added by a call, and those that installed packages offer as entry points."""
+"""Plug-ins by name: the package's own, those registered by a call, and entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vd4rl_pomdp.core.errors import OR_ONES_OWN, UserError, refuse_unknown
 
 Part = TypeVar("Part")
 BY_CALL = "registered by a call"
-"""Origin of the parts that a process has added itself."""
+"""Origin of plug-ins that this process registered itself."""
 REGISTRIES: dict[str, Registry[Any]] = {}
-"""Every registry by its kind, in the order in which they were made."""
+"""Every registry by its setting, in order of creation."""
 
 
 class Registry(Mapping[str, Part], Generic[Part]):
-    """All parts of one kind; reading it loads what installed packages offer, once."""
+    """All plug-ins of one kind. The first access loads those of installed packages."""
 
     def __init__(
         self,
@@ -35,50 +35,51 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """See the class.
 
         Args:
-            kind: what a part is called in messages, `frame encoder`; its plural with underscores names the group of
-                entry points, `vd4rl_pomdp.frame_encoders`, and it is the setting that names a part, `frame_encoder`.
-            own: the package's parts by name.
-            fits: whether an object is a part of this kind.
-            expected: what such an object is, for messages.
-            refuse: raises UserError, without naming the part, for a name or an object of this kind that cannot work.
-            setting: the setting that names a part, if it is not called as the kind.
-            group: the group of entry points, if the kind's plural is another.
+            kind: name of the kind in messages, e.g. `frame encoder`. It also gives the setting that names a
+                plug-in, `frame_encoder`, and the entry-point group, `vd4rl_pomdp.frame_encoders`.
+            own: the package's plug-ins by name.
+            fits: whether an object is a plug-in of this kind.
+            expected: description of such an object, for messages.
+            refuse: raises UserError for a name or object of this kind that cannot work; it need not name the
+                plug-in.
+            setting: the setting that names a plug-in, if not derived from `kind`.
+            group: the entry-point group, if not derived from the setting.
         """
         self.kind, self.setting = kind, setting or kind.replace(" ", "_")
         self.group = group or f"vd4rl_pomdp.{self.setting}s"
         self.broken: dict[str, str] = {}
-        """Offered parts that cannot be loaded, and why."""
+        """Entry points that could not be loaded, and why."""
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
         self.sources: dict[str, str] = {}
-        """Of parts that are not this package's, but for a notebook's cells: the file that registered or offers them and
-        its hash when it was loaded, since that is what runs."""
+        """By name of third-party plug-ins: the file that defines one and the file's hash when it was loaded. Plug-ins
+        defined in notebook cells have no file."""
         self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
         REGISTRIES[self.setting] = self
 
     def register(self, name: str, part: Part, replace: bool = False) -> None:
-        """Add a part of one's own; a name that is taken, or a part that cannot work, raises UserError.
+        """Add your own plug-in; UserError if the name is taken or the plug-in cannot work.
 
         Args:
-            name: what it is called by.
-            part: the part.
-            replace: whether it may take the place of one that such a call added, as where a notebook's cell runs again.
+            name: its name.
+            part: the plug-in.
+            replace: whether it may replace one added by such a call, e.g. when a notebook cell is run again.
         """
         self._add(name, part, BY_CALL, sys._getframe(1).f_code.co_filename, replace)
 
     @property
     def has_added(self) -> bool:
-        """Whether this process has added a part by a call."""
+        """Whether this process registered a plug-in by a call."""
         return BY_CALL in self._origins.values()
 
     def registered(self) -> dict[str, Part]:
-        """The parts that are known without loading what installed packages offer: for code that runs at import."""
+        """The plug-ins known so far, without loading entry points: for code that runs at import."""
         return dict(self._parts)
 
     @contextmanager
     def isolated(self) -> Iterator[None]:
-        """Within the block parts may be registered; after it they are forgotten, as tests want it."""
+        """Forget registrations made within the block, for tests."""
         self._load_offered()
         before = dict(self._parts), dict(self._origins), dict(self.sources)
         try:
@@ -87,7 +88,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
             self._parts, self._origins, self.sources = before
 
     def named(self, name: str) -> Part:
-        """The part called `name`; raises UserError listing the choices, or saying why it cannot be loaded."""
+        """The plug-in called `name`; otherwise UserError with the choices, or the reason why it could not be loaded."""
         self._load_offered()
         if name in self.broken and name not in self._parts:
             raise UserError(
@@ -97,7 +98,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         return self._parts[name]
 
     def origin(self, name: str) -> str:
-        """Where a part comes from: a package and its version, a call, or "" for this package's own."""
+        """Where a plug-in comes from: a package and version, BY_CALL, or "" for this package's own."""
         self._load_offered()
         return self._origins.get(name, "")
 
@@ -129,20 +130,20 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"{self.kind} {name!r}: {error}") from None
         self._parts[name], self._origins[name] = part, origin
         self.sources.pop(name, None)
-        if (path := Path(file)).is_file():  # hashed now: it may be edited while this process runs what it said before
+        if (path := Path(file)).is_file():  # hash now: the file may be edited while this process runs the old code
             self.sources[name] = f"{path.name} {sha256(path.read_bytes()).hexdigest()[:12]}"
 
     def _load_offered(self) -> None:
-        """Add what installed packages offer; what cannot be loaded is told of once, and left out."""
+        """Add the entry points of installed packages; warn about those that cannot be loaded."""
         if self._loaded:
             return
-        self._loaded = True  # first: a package may look into this registry while it is loaded
+        self._loaded = True  # set first: a package may read this registry while it is loaded
         for entry in entry_points(group=self.group):
             try:
                 part = entry.load()
                 origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an installed package"
                 self._add(entry.name, part, origin, getattr(sys.modules[entry.module], "__file__", None) or "")
-            except Exception as error:  # other people's code may raise anything
+            except Exception as error:  # third-party code may raise anything
                 reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
                 self.broken[entry.name] = f"{entry.value}: {' '.join(reason.split())}"
                 warning = f"warning: {self.kind} {entry.name!r} cannot be loaded ({self.broken[entry.name]})"
@@ -150,17 +151,17 @@ class Registry(Mapping[str, Part], Generic[Part]):
 
 
 def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """What a record keeps of the parts that settings name and that are not this package's own.
+    """Origin and source hashes of the third-party plug-ins that settings name, for a run's record.
 
     Args:
-        settings: a stage's settings by name; those that name parts are called as the registries' `setting`.
+        settings: a stage's settings by name; registries are found by their `setting`.
 
     Returns:
         `plugins`: where they come from, {"method mine": "its 1.2"}.
-        `sources`: their files and hashes of them, {"method mine": "mine.py 0123456789ab"}.
+        `sources`: their files and hashes, {"method mine": "mine.py 0123456789ab"}.
     """
     plugins, sources = dict[str, str](), dict[str, str]()
-    for setting, registry in list(REGISTRIES.items()):  # a package that is loaded may make further ones
+    for setting, registry in list(REGISTRIES.items()):  # loading a package may create more registries
         value = str(settings.get(setting, ""))
         for name in [value] if value in registry else value.split("+"):
             part = f"{setting} {name}"
@@ -170,20 +171,20 @@ def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 
 
 def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
-    """The parts that settings name and whose file or package is another by now than the one a run's record tells of."""
+    """Plug-ins named in settings whose code differs from that in a run's record."""
     here = code_of(settings)
     changed = [part for kind in here for part, now in here[kind].items() if record.get(kind, {}).get(part, now) != now]
     return list(dict.fromkeys(changed))
 
 
 def warn_of_other_code(place: object, record: Mapping[str, Any], settings: Mapping[str, Any], what: str) -> None:
-    """Tell of each part whose code is another by now.
+    """Warn about each plug-in whose code has changed.
 
     Args:
         place: what was made with the earlier code.
-        record: what it says of that, as `code_of` does.
-        settings: what names the parts.
-        what: since when, and what that means: ends the sentence.
+        record: record of that code, as from `code_of`.
+        settings: settings that name the plug-ins.
+        what: end of the sentence: since when, and what it means.
     """
     for part in of_other_code(record, settings):
         print(f"warning: {place}: the code of {part} has changed since {what}", file=sys.stderr)

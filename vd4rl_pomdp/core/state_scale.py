@@ -1,4 +1,4 @@
-"""How far each coordinate of a training set's simulator states varies."""
+"""Scale of each coordinate of a training set's simulator states."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ import torch
 from torch import Tensor
 
 LEAST_VARIANCE = 1e-10
-"""A coordinate that varies less counts as constant, as for the probes."""
+"""A coordinate with less variance counts as constant, as in the probes."""
 
 
 @dataclass(frozen=True)
 class StateScale:
-    """Mean and standard deviation of every coordinate, poses first, velocities behind them."""
+    """Mean and standard deviation of every coordinate: poses first, then velocities."""
 
     mean: Tensor
     """(P,) float64."""
     std: Tensor
-    """(P,) float64; 0 for coordinates that are constant."""
+    """(P,) float64; 0 for constant coordinates."""
     pose: int
-    """Coordinates that are pose."""
+    """Number of pose coordinates."""
 
     @classmethod
     def fit(cls, states: Tensor, pose: int) -> Self:
-        """The scale of (N, P) states, the first `pose` columns of which are poses."""
+        """Scale of (N, P) states, whose first `pose` columns are poses."""
         values = states.double()
         variance = values.var(0, correction=0)
         return cls(values.mean(0), torch.where(variance > LEAST_VARIANCE, variance, 0).sqrt(), pose)
 
     def noise(self, pose: float, velocity: float) -> Tensor:
-        """Standard deviations (P,) float64 of normal noise whose mean absolute value is a share of each coordinate's.
+        """Standard deviations (P,) float64 of Gaussian noise whose mean absolute value is a percentage of each
+        coordinate's std.
 
-        Args:
-            pose: percent of a pose's standard deviation.
-            velocity: percent of a velocity's.
+                Args:
+                    pose: percent, for poses.
+                    velocity: percent, for velocities.
         """
         percent = torch.full_like(self.std, velocity)
         percent[: self.pose] = pose

@@ -1,7 +1,7 @@
-"""A run's random numbers: drawn on the CPU from named streams, one by one or, where steps are replayed, in blocks.
+"""A run's random numbers, drawn on the CPU from named streams: one by one or, for CUDA-graph replay, in blocks.
 
-A replayed step cannot draw: it reads. So a stream notes what a step asks for, draws that for a whole block of steps, in
-the order in which they would have drawn it themselves, sends the block in one copy, and hands out a row a step.
+A replayed step cannot draw; it can only read memory. So a stream records what a step asks for, draws it for a block of
+steps in the order in which they would have drawn it, copies the block to the GPU at once, and serves one row per step.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.seeding import stream_generator
 
 BLOCK = 256
-"""Steps that are drawn at once."""
+"""Steps per block."""
 _ALIGNED = 16
-"""Bytes; where a row's numbers may begin, whatever their type."""
+"""Alignment in bytes of each draw within a row, enough for any dtype."""
 
 
 @dataclass(frozen=True)
 class _Draw:
-    """What a step asks for, of each run."""
+    """One request of a step, for each run."""
 
     kind: str
     shape: tuple[int, ...]
     high: tuple[int, ...] = ()
-    """One a run."""
+    """Upper bounds, one per run."""
 
     def made(self, generator: torch.Generator, run: int) -> Tensor:
         if self.kind == "integers":
@@ -44,37 +44,37 @@ class _Draw:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Size in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 class RandomStream:
-    """Numbers of one stream; the same on every device, and the same one by one as in blocks.
+    """Numbers of one stream: the same on every device, and the same one by one as in blocks.
 
-    A stream of several runs that are trained as one (`stacked`) hands out each run's own numbers: every shape that it
-    is asked for, and gives, begins with the number of runs.
+    A stream of several runs trained together (`stacked`) serves each run's own numbers: every shape requested and
+    returned starts with the number of runs.
     """
 
     def __init__(self, generator: torch.Generator, device: torch.device | str = "cpu") -> None:
         """See the class.
 
         Args:
-            generator: on the CPU, at the stream's beginning.
-            device: where the numbers are wanted.
+            generator: on the CPU, at the stream's start.
+            device: device of the returned tensors.
         """
         self._generators, self._device = [generator], torch.device(device)
         self._runs: tuple[int, ...] = ()
-        """Their number, where there are several."""
+        """(number of runs,) for a stacked stream, else ()."""
         self._asked: dict[int, list[_Draw]] = {}
-        """By turn: what its step asked for when it was last run."""
+        """By turn: requests of its step when it last ran eagerly."""
         self._noted: list[_Draw] | None = None
-        """What the step that is run has asked for; None outside of steps that may be replayed."""
+        """Requests of the step that is running; None outside steps that may be replayed."""
         self._turn, self._place = 0, 0
         self._block: Tensor | None = None
         """(BLOCK, runs, bytes) uint8 on the device; None: numbers are drawn one by one."""
 
     def integers(self, high: int | Sequence[int], *shape: int) -> Tensor:
-        """Uniform int64 in [0, high); of several runs each may have a bound of its own."""
+        """Uniform int64 in [0, high); in a stacked stream each run may have its own bound."""
         bounds = (high,) * len(self._generators) if isinstance(high, int) else tuple(high)
         return self._next("integers", shape, bounds)
 
@@ -87,7 +87,7 @@ class RandomStream:
         return self._next("uniform", shape)
 
     def get_state(self, run: int = 0) -> Tensor:
-        """State of a run's generator after the steps that were made, whatever was drawn ahead."""
+        """Generator state of a run after the steps done so far, ignoring numbers drawn ahead."""
         if self._block is None:
             return self._generators[run].get_state()
         made = torch.Generator()
@@ -96,14 +96,14 @@ class RandomStream:
         return made.get_state()
 
     def set_state(self, state: Tensor) -> None:
-        """Go on from `get_state`, as a stream of one run."""
+        """Resume from `get_state`; for a stream of one run."""
         (generator,) = self._generators
         generator.set_state(state)
         if self._block is not None:
             self._before, self._used, self._filled = [state.clone()], 0, False
 
     def begin(self, turn: int) -> None:
-        """A step of a turn begins: what it asks for is noted, or, in blocks, read from its row."""
+        """Start a step of `turn`: record its requests or, in blocks, read from its row."""
         self._turn, self._place = turn, 0
         if self._block is None:
             self._noted = self._asked[turn] = []
@@ -111,7 +111,7 @@ class RandomStream:
             self._row = self._block.index_select(0, self._counter)[0]
 
     def end(self) -> None:
-        """The step has asked for all its numbers; in blocks, the next row's turn has come. Part of a replayed step."""
+        """End a step; in blocks, advance to the next row. Part of what is captured and replayed."""
         self._noted = None
         if self._block is not None:
             if self._place < len(self._asked[self._turn]):
@@ -119,7 +119,7 @@ class RandomStream:
             self._counter.add_(1)
 
     def in_blocks(self) -> None:
-        """Draw in blocks from now on; a step of every turn has been run, turn 0 comes next."""
+        """Switch to blocks. Every turn must have run once, and turn 0 comes next."""
         self._offsets, width = {}, _ALIGNED
         for turn, asked in self._asked.items():
             ends = [0]
@@ -132,7 +132,7 @@ class RandomStream:
         self._before, self._used, self._first, self._filled = self._states(), 0, 0, False
 
     def one_by_one(self) -> None:
-        """Draw one by one again, from where the steps made so far end."""
+        """Switch back to drawing one by one, continuing after the steps done so far."""
         self._noted = None
         if self._block is not None:
             states = [self.get_state(run) for run in range(len(self._generators))]
@@ -141,14 +141,14 @@ class RandomStream:
             self._block = None
 
     def provide(self, turn: int) -> None:
-        """See to it that the block holds the next step's row; called before a step of `turn` is replayed."""
+        """Ensure that the block holds the next step's row; called before a step of `turn` is replayed."""
         assert self._block is not None
         if self._used == BLOCK or not self._filled:
             self._before, self._first = self._states(), turn
             rows = torch.zeros(self._block.shape, dtype=torch.uint8, pin_memory=self._device.type == "cuda")
             for run, generator in enumerate(self._generators):
                 self._draw_steps(generator, run, BLOCK, rows[:, run])
-            # pinned memory that is freed here is not used again before the copy has ended
+            # PyTorch does not reuse freed pinned memory before the copy has finished
             self._block.copy_(rows, non_blocking=True)
             self._counter.zero_()
             self._used, self._filled = 0, True
@@ -158,7 +158,8 @@ class RandomStream:
         return [generator.get_state() for generator in self._generators]
 
     def _draw_steps(self, generator: torch.Generator, run: int, steps: int, rows: Tensor | None = None) -> None:
-        """Draw what `steps` steps of a run from the block's first turn on ask for, into (steps, bytes) if there are."""
+        """Draw the numbers for `steps` steps of a run from the block's first turn on; store them in `rows` (steps,
+        bytes) if given."""
         for step in range(steps):
             turn = (self._first + step) % len(self._asked)
             for draw, offset in zip(self._asked[turn], self._offsets[turn], strict=True):
@@ -178,7 +179,7 @@ class RandomStream:
                 self._noted.append(draw)
             made = [draw.made(generator, run) for run, generator in enumerate(self._generators)]
             drawn = torch.stack(made) if self._runs else made[0]
-            # to a GPU without waiting; to the CPU a copy would be read before it has come
+            # asynchronous to a GPU; to the CPU that would allow reads before the copy is done
             return drawn.to(self._device, non_blocking=self._device.type != "cpu")
         asked, place = self._asked[self._turn], self._place
         if place >= len(asked) or asked[place] != draw:
@@ -189,12 +190,12 @@ class RandomStream:
 
 
 def random_stream(seed: int, *name: str | int, device: torch.device | str = "cpu") -> RandomStream:
-    """The stream called `name` of a run (see `stream_seed`), for a device."""
+    """The stream called `name` of a run (see `stream_seed`) on a device."""
     return RandomStream(stream_generator(seed, *name), device)
 
 
 def stacked(streams: Sequence[RandomStream]) -> RandomStream:
-    """One stream of several runs, from where their own stand, which stay there; one by one at first."""
+    """One stream for several runs, continuing from copies of their states. Draws one by one at first."""
     one = RandomStream(torch.Generator(), streams[0]._device)
     one._generators = [torch.Generator() for _ in streams]
     for generator, stream in zip(one._generators, streams, strict=True):

@@ -1,7 +1,7 @@
-"""Tasks by name: the benchmark's three with V-D4RL's conventions, those added by a call, and those of other packages.
+"""Tasks by name: the benchmark's three with V-D4RL's conventions, memory tasks, and those added by users or packages.
 
-A task is dm_control's (`DMCTask`) or any Gymnasium environment with pixels (`GymnasiumTask`). What a task's name means,
-its parameters included, is fixed where it is registered: no flag changes it.
+A task is a dm_control task (`DMCTask`) or any Gymnasium environment with pixels (`GymnasiumTask`). A name fixes all of
+a task's parameters; no flag changes them.
 """
 
 from __future__ import annotations
@@ -17,54 +17,58 @@ from vd4rl_pomdp.core.errors import MOST, MOST_ROWS, UserError, refuse_unknown
 from vd4rl_pomdp.core.registry import Registry
 
 FRAME_SIZE = 84
-"""Height and width of the benchmark's frames."""
+"""Height and width of the benchmark's frames in pixels."""
 FRAME_SIZES = (16, 480)
-"""Smallest and largest frames that can be collected."""
+"""Smallest and largest frame size that can be collected."""
 FRAME_STACK = 3
 ACTION_REPEAT = 2
 EPISODE_TRANSITIONS = 500
-"""Decisions an episode of the benchmark: 1000 simulator steps at action repeat 2; an episode has one row more."""
+"""Decisions per benchmark episode: 1000 simulator steps at action repeat 2. An episode has one more row than
+decisions."""
 MOST_EPISODES = 10**6
-"""Most episodes that any command makes or plays at once."""
+"""Maximum episodes that a command collects or plays."""
 SCORE_DIVISOR = 10.0
 """V-D4RL's normalised score is return / 10."""
 Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
-"""V-D4RL's."""
+"""V-D4RL's dataset qualities."""
 NoisyQuality = Literal["medium_noisy", "medium_expert_noisy", "expert_noisy"]
 NOISY_QUALITIES: tuple[NoisyQuality, ...] = get_args(NoisyQuality)
-"""This package's own: where actions are not decided by the state, an inverse model can tell them from what they did."""
+"""This package's own. With action noise, the state does not determine the action, so an inverse model must infer it
+from its effects."""
 SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)
-"""All that `data collect` makes."""
+"""All qualities that `data collect` can make."""
 UNKNOWN_QUALITY = "unknown"
-"""What stands for a quality that neither a set's files nor its folders tell."""
+"""Placeholder for a quality that neither the files nor the folder names of a dataset reveal."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Widths of what the rows of a task hold."""
+    """Dimensions of a task's rows."""
 
     action_dim: int
     state_dim: int = 0
-    """Width of dm_control's observations, flattened and concatenated in their own order; 0: the task has no states."""
+    """Width of dm_control's observations, flattened and concatenated in their own order; 0: no states."""
     positions: int = 0
-    """Generalised positions: the first columns of the simulator state, velocities the others."""
+    """Number of generalised positions, the first columns of the simulator state; the rest are velocities."""
     travel: tuple[int, ...] = ()
-    """Positions along the ground, which a tracking camera does not show."""
+    """Positions along the ground, invisible to a tracking camera."""
     turning: tuple[int, ...] = ()
-    """Positions that are angles without limits: a full turn more looks the same."""
+    """Unlimited angles: a full turn looks the same."""
     quaternions: tuple[int, ...] = ()
-    """First of the four positions of every unit quaternion: one of the other sign looks the same."""
+    """First index of each unit quaternion's four positions; q and -q look the same."""
     beside: tuple[int, ...] = ()
-    """First of the two positions along the ground of other bodies, which are seen from where the travelling one is."""
+    """First index of the two ground positions of each other body; the camera sees them relative to the travelling
+    body."""
     unseen: tuple[int, ...] = ()
-    """Positions of bodies without a shape, which no picture shows: what an episode has still to come."""
+    """Positions of invisible bodies, which encode upcoming events of the episode."""
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
-        """What (..., P) simulator states look like, in coordinates without winding: equal for equal looks.
+        """Visible pose of (..., P) simulator states, equal for states that look equal.
 
-        Limited positions, sine and cosine of turning angles, then two columns of every quaternion's rotation matrix
-        (Zhou et al. 2019, arXiv 1812.07035); of places on the ground, where others are beside the travelling body.
+        Columns: limited positions, sine and cosine of turning angles, then two columns of every quaternion's
+            rotation matrix (Zhou et al. 2019, arXiv 1812.07035). Other bodies' ground positions are relative to
+            the travelling body.
         """
         positions, turning = physics[..., : self.positions].copy(), physics[..., list(self.turning)]
         for first in self.beside:
@@ -93,42 +97,41 @@ def _two_columns(quaternion: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What the harness needs of any task."""
+    """Settings common to all tasks."""
 
     action_repeat: int
-    """Steps for which an action is applied, and their rewards summed."""
+    """Simulator steps per action; their rewards are summed."""
     decisions: int = EPISODE_TRANSITIONS
-    """Decisions after which an episode is cut off, unless it ends before."""
+    """Decisions after which an episode is truncated."""
     score_divisor: float = SCORE_DIVISOR
-    """A score is a return divided by this."""
+    """score = return / score_divisor."""
     action_noise: float | None = None
-    """Standard deviation of the noise in the noisy sets; None: it has none."""
+    """Standard deviation of the action noise in noisy datasets; None: the task has none."""
     layout: Layout | None = None
-    """Widths of its rows, if they are to be known without building the environment; None: found from it (see
-    `envs.make.layout_of`)."""
+    """Dimensions of its rows. None: found by building the environment (see `envs.make.layout_of`)."""
 
     @property
     def summary(self) -> str:
-        """One line that says what it is."""
+        """One-line description."""
         return f"each action {self.action_repeat} times, {self.decisions} decisions an episode"
 
 
 @dataclass(frozen=True)
 class DMCTask(Task):
-    """A task of dm_control's suite; its simulator states are stored, and its rewards replay from them."""
+    """A dm_control task. Its simulator states are stored, and its rewards can be recomputed from them."""
 
     domain: str
-    """Of the suite, or the dotted name of a module that is written like one of its: its `SUITE` maps names of tasks to
+    """Domain of dm_control's suite, or the dotted name of a module written like one: its `SUITE` maps task names to
     functions of `random` and `time_limit`."""
     task: str
     camera: int = 0
-    """Number of the camera that shows it."""
+    """Number of the rendering camera."""
     action_repeat: int = field(default=ACTION_REPEAT, kw_only=True)
-    """Simulator steps for which an action is applied, and their rewards summed."""
+    """Simulator steps per action; their rewards are summed."""
 
     @property
     def summary(self) -> str:
-        """One line that says what it is."""
+        """One-line description."""
         own = "." in self.domain
         shown = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
         return f"{shown}, camera {self.camera}, {super().summary}"
@@ -136,32 +139,32 @@ class DMCTask(Task):
 
 @dataclass(frozen=True)
 class GymnasiumTask(Task):
-    """A Gymnasium environment with pixels and bounded Box actions, which are rescaled to [-1, 1]; it has no states."""
+    """A Gymnasium environment with pixels and bounded Box actions, rescaled to [-1, 1]. It has no simulator states."""
 
     environment: str | Callable[..., Any]
-    """Id of the environment, or what makes it: a class or a function of a module."""
+    """Environment id, or a class or module-level function that makes it."""
     arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Keyword arguments of the environment."""
     pixels: Literal["render", "observation"] = "render"
-    """Where the picture comes from: `render()` under render_mode "rgb_array", or the observation itself."""
+    """Source of the frames: `render()` with render_mode "rgb_array", or the observation itself."""
     action_repeat: int = field(default=1, kw_only=True)
-    """Steps for which an action is applied, and their rewards summed; an episode that ends ends it, too."""
+    """Environment steps per action; their rewards are summed. Stops early when an episode ends."""
 
     @property
     def name(self) -> str:
-        """The environment's: its id, or that of what makes it."""
+        """Environment id, or the name of the class or function that makes it."""
         if isinstance(self.environment, str):
             return self.environment
         return getattr(self.environment, "__name__", repr(self.environment))
 
     @property
     def summary(self) -> str:
-        """One line that says what it is."""
+        """One-line description."""
         return f"Gymnasium's {self.name}, {super().summary}"
 
 
 def _refuse(name: str, task: Task) -> None:
-    """Raise UserError for numbers and words that make no task."""
+    """Raise UserError for invalid task settings."""
     for what, most in (("decisions", MOST_ROWS - 1), ("action_repeat", MOST)):
         number = getattr(task, what)
         if not isinstance(number, int) or not 1 <= number <= most:
@@ -194,5 +197,5 @@ TASKS: Registry[Task] = Registry(
     "a vd4rl_pomdp.core.tasks.DMCTask or GymnasiumTask",
     _refuse,
 )
-"""All tasks. Packages offer theirs in the group of entry points `vd4rl_pomdp.tasks`. The noise of the benchmark's is of
-0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert more than half of its mean return."""
+"""All tasks. Packages add theirs through the entry-point group `vd4rl_pomdp.tasks`. The noise of the benchmark tasks is
+the largest of 0.2, 0.3, 0.4 and 0.5 that leaves the expert more than half of its mean return."""

@@ -1,4 +1,4 @@
-"""Names that others chose, such as a method's, as text that a page, a figure or a terminal shows as it is."""
+"""Escapes user-chosen names, such as a method's, for Markdown pages, figures and terminals."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ _MARKS = re.compile(r"([\\*\[\]~]|(?<!\w)_|_(?!\w))")
 
 
 def one_line(text: str) -> str:
-    """Text on one line, with a question mark for every character that cannot be shown."""
+    """Text on one line, with "?" for unprintable characters."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.splitlines()).replace("\t", " "))
 
 
 def markdown(text: str) -> str:
-    """Text for a Markdown paragraph or table cell that neither ends it nor marks anything up."""
+    """Escape text for a Markdown paragraph or table cell."""
     marked = _MARKS.sub(r"\\\1", one_line(text))
     return "".join(_ENTITIES.get(c, c) for c in marked)
 
 
 def code(text: str) -> str:
-    """Text as a Markdown code span that fits into a table cell."""
+    """Text as a Markdown code span that is safe in a table cell."""
     shown = one_line(text).replace("|", r"\|")
     fence = _fence(shown, 1)
     return f"{fence}{shown}{fence}" if "`" not in shown else f"{fence} {shown} {fence}"
 
 
 def code_block(lines: list[str], language: str) -> list[str]:
-    """Lines as a fenced Markdown block that no line of them ends."""
+    """Lines as a fenced Markdown block, with a fence longer than any in the text."""
     shown = list(map(one_line, lines))
     fence = _fence("\n".join(shown), 3)
     return [f"{fence}{language}", *shown, fence]
@@ -41,7 +41,8 @@ def _fence(text: str, least: int) -> str:
 
 
 def plain(text: str, width: int | None = None) -> str:
-    """Text for a figure: no formula between dollars, no label hidden by a leading underscore, wrapped to `width`."""
+    """Escape text for matplotlib: no math between dollars, no leading underscore (hidden labels); wrapped to
+    `width`."""
     shown = one_line(text)
     lines = textwrap.wrap(shown, width, break_long_words=True) if width else [shown]
     joined = "\n".join(lines).replace("$", r"\$")
@@ -49,5 +50,5 @@ def plain(text: str, width: int | None = None) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a page as UTF-8; what UTF-8 cannot hold, such as half a character of a file's name, is spelt out."""
+    """Write UTF-8 text; characters that UTF-8 cannot encode (e.g. lone surrogates in file names) become escapes."""
     path.write_text(text, encoding="utf-8", errors="backslashreplace")

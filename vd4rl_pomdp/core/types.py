@@ -33,22 +33,22 @@ class StepType(IntEnum):
 
 
 _T_BITS = (MOST_ROWS - 1).bit_length()
-"""Bits of a row's place within its episode."""
+"""Bits for the row number in a `row_key`."""
 
 
 def row_key(episode: Tensor, t: Tensor) -> Tensor:
-    """Name of row t of an episode as one int64, the same in a data set and in the environment."""
+    """Unique int64 key of row t of an episode, the same in a dataset and in the environment."""
     return (episode << _T_BITS) | t
 
 
 def unpack_row_key(key: Tensor) -> tuple[Tensor, Tensor]:
-    """Episode and t that a `row_key` names."""
+    """Episode and t of a `row_key`."""
     return key >> _T_BITS, key & ((1 << _T_BITS) - 1)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """A group of tensors that share their first dimension; fields can also be read as `batch["obs"]`."""
+    """Tensors that share their first dimension. Fields can also be read as `batch["obs"]`."""
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self.keys():
@@ -64,31 +64,31 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Self:
         """Copy of the batch with every tensor on `device`."""
-        ahead = torch.device(device).type != "cpu"  # a CPU would read before the copy has come
+        ahead = torch.device(device).type != "cpu"  # a non-blocking copy to the CPU could be read before it is done
         return self.replace(**{name: self[name].to(device, non_blocking=ahead) for name in self.keys()})
 
     def replace(self, **changes: Any) -> Self:
-        """Copy of the batch with some tensors exchanged."""
+        """Copy of the batch with some tensors replaced."""
         return replace(self, **changes)
 
 
 @dataclass(frozen=True)
 class Transitions(Batch):
-    """n-step transitions (o_t, a_t, r, d, o_{t+n}); nothing crosses an episode's end."""
+    """n-step transitions (o_t, a_t, r, d, o_{t+n}); none crosses the end of an episode."""
 
     obs: Tensor
-    """(B, C, H, W) uint8: frames t-2..t, oldest first, the first frame repeated at an episode's start."""
+    """(B, C, H, W) uint8: frames t-2..t, oldest first; an episode's first frame is repeated at its start."""
     action: Tensor
     """(B, A) float32: a_t."""
     reward: Tensor
-    """(B,) float32: sum of gamma^i d_i r_{t+i} over the steps up to t+n or the episode's end, with d_i the product of
-    the stored discounts before."""
+    """(B,) float32: sum of gamma^i d_i r_{t+i} up to t+n or the end of the episode, where d_i is the product of the
+    preceding stored discounts."""
     discount: Tensor
     """(B,) float32: product of the stored discounts, times gamma for every step after the first."""
     next_obs: Tensor
     """(B, C, H, W) uint8: the stack at t+n, or at the episode's last row if that comes first."""
     key: Tensor
-    """(B,) int64: `row_key` of row t, which keys `emission` corruptions."""
+    """(B,) int64: `row_key` of row t, the random key of `emission` corruptions."""
     next_key: Tensor
     """(B,) int64: `row_key` of next_obs."""
     next_action: Tensor
@@ -100,32 +100,32 @@ class Windows(Batch):
     """Consecutive rows of one episode each. Row j shows o_j, a_{j-1} (`prev_action`) and a_j (`action`)."""
 
     obs: Tensor
-    """(B, T, C, H, W) uint8: a frame stack a row, built within the episode (it may reach before the window)."""
+    """(B, T, C, H, W) uint8: one frame stack per row, built within the episode (it may reach before the window)."""
     prev_action: Tensor
     """(B, T, A) float32: a_{j-1}; zero in the window's first row and in padding."""
     action: Tensor
     """(B, T, A) float32: a_j; zero where `has_action` is False."""
     has_action: Tensor
-    """(B, T) bool: False at an episode's last row (no a_j exists there) and in padding."""
+    """(B, T) bool: False in padding and at an episode's last row, where no a_j exists."""
     length: Tensor
-    """(B,) int64: real rows of each window; rows at and after it are padding."""
+    """(B,) int64: real rows of each window; rows from this index on are padding."""
     key: Tensor
-    """(B, T) int64: `row_key` of every row, which keys `emission` corruptions."""
+    """(B, T) int64: `row_key` of every row, the random key of `emission` corruptions."""
 
     @property
     def real(self) -> Tensor:
-        """(B, T) bool: rows that are no padding."""
+        """(B, T) bool: True for real rows, False for padding."""
         return torch.arange(self.has_action.shape[1], device=self.length.device) < self.length[:, None]
 
 
 def previous(action: Tensor) -> Tensor:
-    """a_{j-1} of every row, zero in the first, from (B, T, A) a_j: what `Windows` show where no action came before."""
+    """Shift (B, T, A) actions a_j to a_{j-1}, with zeros in the first row, as `Windows.prev_action`."""
     return torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1)
 
 
 @dataclass(frozen=True)
 class StateWindows(Windows):
-    """Windows that also tell the true state: for methods that are trained on it, and for no other."""
+    """Windows with the true simulator state, only for methods that are trained on it."""
 
     state: Tensor
-    """(B, T, P) float32: pose and velocity of every row, as `Dataset.states` has them."""
+    """(B, T, P) float32: pose and velocity of every row, as in `Dataset.states`."""

@@ -1,4 +1,4 @@
-"""Corruptions that make the observations partial."""
+"""Corruptions that make observations partial."""
 
 from vd4rl_pomdp.corruptions.corruption import (
     CORRUPTIONS,

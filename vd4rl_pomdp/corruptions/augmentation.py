@@ -1,8 +1,8 @@
-"""Random shift (Kostrikov et al. 2020, arXiv 2004.13649): pad by repeating the border, crop at a random place.
+"""Random shift (Kostrikov et al. 2020, arXiv 2004.13649): pad by replicating the border, crop at a random position.
 
-Images are shifted by whole pixels: by an index on a GPU, by lines of memory on a CPU. DrQ interpolates at the same
-places with weights that are 0 and 1 but for float32's rounding: of random pixels 59% come out the same to the last bit,
-the others within 0.004 of 255.
+Images are shifted by whole pixels, by gather on a GPU and by copying lines of memory on a CPU. DrQ's grid_sample does
+the same with interpolation weights that are 0 and 1 up to float32 rounding: of random pixels 59% are bit-identical, the
+others differ by at most 0.004 of 255.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from vd4rl_pomdp.core.buffers import BUFFERS
 from vd4rl_pomdp.corruptions.keys import draw_integers
 
 Sharing = Literal["window", "observation"]
-"""What of a batch of windows one random shift is shared by: all observations of a window, or the frames of one."""
+"""Which images get the same random shift: all observations of a window, or only the frames of one observation."""
 
 
 def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
     """Shift images by up to `pad` pixels in each direction.
 
     Args:
-        obs: (N, ..., H, W) uint8; everything under one leading index moves together.
-        key: (N,) int64, one shift a key.
+        obs: (N, ..., H, W) uint8; all images under one leading index get the same shift.
+        key: (N,) int64 random keys, one per shift.
         pad: largest shift in pixels; 0 returns `obs`.
 
     Returns:
@@ -45,7 +45,7 @@ def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
 
 
 def draw_offset(key: Tensor, pad: int) -> Tensor:
-    """Shifts (N, 2) int64, rows and columns, in -pad..pad, from (N,) int64 keys."""
+    """Random shifts (N, 2) int64 as (rows, columns), in -pad..pad, from (N,) int64 keys."""
     return draw_integers(key, 2 * pad + 1, 2) - pad
 
 
@@ -56,7 +56,7 @@ def by_lines(images: Tensor, pad: int) -> bool:
 
 
 def shift_by_index(obs: Tensor, offset: Tensor) -> Tensor:
-    """(N, ..., H, W) images shifted by (N, 2), by one gather of single pixels: right for a GPU, slow on a CPU."""
+    """Shift (N, ..., H, W) images by (N, 2) offsets with one gather per pixel: fast on a GPU, slow on a CPU."""
     n, height, width = obs.shape[0], obs.shape[-2], obs.shape[-1]
     y = (offset[:, :1] + torch.arange(height, device=obs.device)).clamp_(0, height - 1)
     x = (offset[:, 1:] + torch.arange(width, device=obs.device)).clamp_(0, width - 1)
@@ -66,15 +66,15 @@ def shift_by_index(obs: Tensor, offset: Tensor) -> Tensor:
 
 
 def shift_by_lines(images: Tensor, chosen: Tensor, offset: Tensor, out: Tensor) -> None:
-    """Write the (M,) `chosen` ones of (N > 2, planes, H, W) images, shifted, into `out`: many times as fast on a CPU.
+    """Write images `chosen` (M,) of (N > 2, planes, H, W), shifted by `offset` (M, 2), to `out`; much faster on a CPU.
 
-    A shifted line is a run of bytes in memory that begins dx further on; only what the run holds of the line beside it
-    must then be overwritten by the border.
+    A line shifted by dx is the run of W bytes that starts dx bytes later in memory. The bytes of the neighbouring line
+    at its end (or start) are then overwritten by the border pixel.
     """
     n, planes, height, width = images.shape
-    # Row i is the run of `width` bytes that begins at byte i of all images: overlapping views, nothing is copied.
+    # runs[i] is the `width` bytes starting at byte i of all images: overlapping views, no copy.
     runs = images.as_strided((images.numel() - width + 1, width), (1, 1))
-    # Runs of the first and the last image may reach beyond the memory; these are shifted by index, at the end.
+    # Runs of the first and last image may reach beyond the memory: clamp here, and shift these by index below.
     inner = chosen.clamp(1, n - 2)
     dy, dx = offset.unbind(1)
     line = (dy[:, None] + torch.arange(height)).clamp_(0, height - 1)
@@ -82,14 +82,14 @@ def shift_by_lines(images: Tensor, chosen: Tensor, offset: Tensor, out: Tensor) 
     start = start[:, None] + torch.arange(planes)[:, None] * (height * width)
     torch.index_select(runs, 0, start.flatten(), out=out.view(start.numel(), width))
     _repeat_borders(out.view(len(out), planes * height, width).numpy(), dx.numpy())
-    ends = (chosen != inner).nonzero()[:, 0]  # whose runs may reach beyond the images' memory
+    ends = (chosen != inner).nonzero()[:, 0]  # the clamped ones
     out[ends] = shift_by_index(images[chosen[ends]], offset[ends])
 
 
 def _repeat_borders(images: np.ndarray, shift: np.ndarray) -> None:
-    """Overwrite the columns of (M, lines, W) images that an (M,) shift brought in by the outermost true one."""
+    """Overwrite the columns of (M, lines, W) images that an (M,) shift moved in by the nearest image column."""
     width = images.shape[-1]
-    # At most 2 * pad different shifts, each with a few columns: two short loops, whatever the batch.
+    # At most 2 * pad distinct shifts of at most pad columns: two short loops, whatever the batch size.
     for size in np.unique(shift[shift != 0]).tolist():
         moved = np.flatnonzero(shift == size)
         edge = width - 1 - size if size > 0 else -size

@@ -1,7 +1,7 @@
-"""What makes the pixels a POMDP: patches and zeroed frames (Wu et al. 2024, section 4.2), stacks of one frame.
+"""Corruptions that turn the pixels into a POMDP: patches and zeroed frames (Wu et al. 2024, section 4.2), truncation.
 
-A corruption is a pure function of a batch of frame stacks and their keys. The same object serves batches of a data set
-(on any device) and the environment at evaluation, and equal keys give equal masks on both.
+A corruption is a pure function of a batch of frame stacks and random keys. Training (on any device) and evaluation in
+the environment use the same object, and equal keys give equal masks.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _CHANNELS = 3
 
 
 class Stage(Protocol):
-    """One step of a corruption, applied to the frames that are not zeroed; a dataclass of its own options.
+    """One step of a corruption: a dataclass of options that modifies frames. It does not see frames that are zeroed.
 
-    With the methods of `fused.Hiding`, too, a GPU needs no pass of its own for it.
+    A stage that also implements `fused.Hiding` is fused with the others into one pass on a GPU.
     """
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
@@ -38,39 +38,39 @@ class Stage(Protocol):
 
         Args:
             frames: (N, K, 3, H, W) uint8, K frames of each stack.
-            key: (N,) int64, what to draw from.
-            number: (N, K) int64 place of each frame in its stack.
+            key: (N,) int64 random keys.
+            number: (N, K) int64 index of each frame in its stack, 0 the oldest.
         """
 
 
 @dataclass(frozen=True)
 class Patch(Options):
-    """Squares of every frame, at uniformly random places, take one value."""
+    """Fills squares at uniformly random positions of every frame with one value."""
 
     patch_size: int = 16
-    """Side of a patch in pixels."""
+    """Side length of a patch in pixels."""
     patch_count: int = 1
-    """Patches a frame."""
+    """Patches per frame."""
     patch_fill: int = 0
     """Pixel value inside a patch."""
     patch_shared: bool = False
-    """Whether the frames of a stack share their patches."""
+    """Put the patches at the same positions in all frames of a stack."""
 
     summary: ClassVar[str] = "squares of every frame, at uniformly random places, take one value"
     limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": (1, 1000), "patch_fill": (0, 255)}
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
-        """See `Stage`."""
+        """Fill the patches; see `Stage`."""
         n, k, _, height, width = frames.shape
         top, left = self._corners(key, number, height, width)
-        # Every square of the frames by its corner, as a view: writing into it writes into the frames.
+        # A view of every possible square, indexed by its corner: writing to it writes to the frames.
         squares = frames.unfold(3, self.patch_size, 1).unfold(4, self.patch_size, 1)
         sample = torch.arange(n, device=key.device)[:, None, None]
         frame = torch.arange(k, device=key.device)[:, None]
         target, index = squares.movedim(2, 4), (sample, frame, top, left)
-        if buffers.in_host_memory(target):  # where numpy is several times as fast
+        if buffers.in_host_memory(target):  # on a CPU numpy is several times faster
             target.numpy()[tuple(part.numpy() for part in index)] = self.patch_fill
-        else:  # as an assignment, the value would come from the CPU, and that be waited for
+        else:  # target[index] = value would copy the value from the CPU and synchronise
             target.index_put_(index, torch.full((), self.patch_fill, dtype=target.dtype, device=target.device))
 
     @property
@@ -79,7 +79,7 @@ class Patch(Options):
         return self.patch_fill
 
     def places(self, key: Tensor, number: Tensor, height: int, width: int) -> Tensor:
-        """See `Hiding`: (N, K, patches, 2) upper left corners."""
+        """Upper left corners (N, K, patches, 2); see `Hiding`."""
         return torch.stack(self._corners(key, number, height, width), -1)
 
     def hides(self, places: Tensor, y: Tensor, x: Tensor) -> Tensor:
@@ -89,7 +89,7 @@ class Patch(Options):
         return inside.any(2)
 
     def _corners(self, key: Tensor, number: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """Rows and columns (N, K, patches) of the upper left corners."""
+        """Rows and columns, each (N, K, patches), of the upper left corners."""
         if self.patch_size > min(height, width):
             raise UserError(
                 f"patch size {self.patch_size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
@@ -99,34 +99,37 @@ class Patch(Options):
             *number.shape, self.patch_count
         )
         top = draw_numbered(key, height - self.patch_size + 1, draw)
-        # Hashed once more: from the key itself rows and columns would draw the same.
+        # Hash the key again, or rows and columns would be the same draws.
         return top, draw_numbered(hash_keys(key), width - self.patch_size + 1, draw)
 
 
 @dataclass(frozen=True)
 class FrameDrop(Options, ABC):
-    """Whole frames of every stack become 0. No stage sees them any more: it may only end a corruption's name."""
+    """Zeroes whole frames of every stack. It must be the last stage of a corruption, since no stage sees these frames.
+
+    The `dropped` frames with the lowest `order` become 0.
+    """
 
     @abstractmethod
     def dropped(self, stack: int) -> int:
-        """How many frames of a stack of `stack` become 0; raises UserError where it cannot be."""
+        """Number of frames to zero in a stack of `stack` frames; UserError if that is impossible."""
 
     @abstractmethod
     def order(self, key: Tensor, stack: int) -> Tensor:
-        """In which order they do: (N, stack) int64, the frame of the lowest number first; (N,) int64 keys to draw from.
+        """Priority (N, stack) int64 of each frame, oldest first in the row; the lowest are zeroed, in ties the older.
 
-        A frame's place in its stack is that in the row, the newest last; of equal numbers the older frame comes first.
+        `key` are (N,) int64 random keys.
         """
 
 
 @dataclass(frozen=True)
 class ZeroFrames(FrameDrop):
-    """Frames of every stack, chosen uniformly, become 0, the newest perhaps among them."""
+    """Zeroes a number of uniformly chosen frames of every stack, which may include the newest."""
 
     zeroed_frames: int = 2
-    """Frames of a stack that are blanked."""
+    """Frames to zero per stack."""
     keep_newest: bool = False
-    """Whether they are chosen among the older frames alone, so that the newest is always seen."""
+    """Never zero the newest frame: choose among the older ones only."""
 
     summary: ClassVar[str] = (
         "frames of every stack, chosen uniformly, become 0; it must come last, as in patch+zero_frames"
@@ -143,24 +146,24 @@ class ZeroFrames(FrameDrop):
         return self.zeroed_frames
 
     def order(self, key: Tensor, stack: int) -> Tensor:
-        """See `FrameDrop`: numbers sorted by random draws are a uniform permutation."""
+        """Random priorities, which give a uniform permutation; see `FrameDrop`."""
         draws = draw_integers(key, DRAWS, stack)
         if self.keep_newest:
-            draws[:, -1] = DRAWS  # above all draws
+            draws[:, -1] = DRAWS  # larger than any draw, so never zeroed
         return draws
 
 
 @dataclass(frozen=True)
 class Truncate(FrameDrop):
-    """All frames of a stack but one become 0: the newest, or the oldest, which was seen two steps before."""
+    """Zeroes all frames of a stack except the newest, or except the oldest, which is two steps old."""
 
     kept: Literal["newest", "oldest"] = "newest"
-    """The frame of a stack that stays: newest or oldest."""
+    """The frame to keep: newest or oldest."""
 
     summary: ClassVar[str] = "all frames of every stack but the newest, or the oldest, become 0; it must come last"
 
     def check(self) -> None:
-        """Raise UserError for another frame."""
+        """Raise UserError for invalid options."""
         refuse_unknown("--kept", self.kept, ("newest", "oldest"))
         super().check()
 
@@ -169,7 +172,7 @@ class Truncate(FrameDrop):
         return stack - 1
 
     def order(self, key: Tensor, stack: int) -> Tensor:
-        """See `FrameDrop`: nothing is drawn."""
+        """Deterministic priorities; see `FrameDrop`."""
         place = torch.arange(stack, device=key.device)
         return (place if self.kept == "newest" else -place).expand(len(key), stack)
 
@@ -184,7 +187,7 @@ def _drops(part: Any) -> bool:
 
 
 def _refuse_stage(name: str, kind: type[Options]) -> None:
-    """Raise UserError for a stage that no corruption's name could tell of, or whose options cannot work."""
+    """Raise UserError for a stage with a reserved name or invalid options."""
     if name == "none" or "+" in name:
         raise UserError("'none' and names with '+' mean no stage, or several: choose another name")
     refuse_options(kind)
@@ -197,15 +200,15 @@ STAGES: Registry[type[Options]] = Registry(
     "a class of vd4rl_pomdp.core.options.Options with the method of a Stage, or a FrameDrop",
     _refuse_stage,
 )
-"""Every stage by name: a dataclass of its options that is a `Stage`, or a `FrameDrop`. A corruption's name joins its
-stages with `+`, in the order in which they are applied. Packages offer theirs in the group of entry points
+"""All stages by name; each is a dataclass of options that is a `Stage` or a `FrameDrop`. A corruption is named by its
+stages joined with `+`, in order of application. Other packages add stages through the entry point group
 `vd4rl_pomdp.corruptions`."""
 CORRUPTIONS = ("none", "patch", "zero_frames", "patch+zero_frames")
-"""The paper's settings, and the fully observed control."""
+"""The paper's corruptions, and none as the fully observed control."""
 
 
 def _kinds(corruption: str) -> list[type[Options]]:
-    """Classes of a corruption's stages; an unknown or a repeated name raises UserError."""
+    """Stage classes of a corruption, such as [Patch, ZeroFrames]; UserError for an unknown or repeated name."""
     names = [] if corruption == "none" else corruption.split("+")
     kinds = [STAGES.named(name) for name in dict.fromkeys(names)]
     if len(kinds) < len(names) or any(map(_drops, kinds[:-1])):
@@ -218,27 +221,27 @@ def _kinds(corruption: str) -> list[type[Options]]:
 
 @dataclass(frozen=True)
 class CorruptionConfig(Options):
-    """Which corruption, and its stages with their options; `of` makes one from names and values."""
+    """A corruption's name, mode and stages with their options; create one with `CorruptionConfig.of`."""
 
     corruption: str = "none"
-    """none, or names of stages joined by +: patch, zero_frames, truncate, patch+zero_frames, ..."""
+    """none, or stages joined by +: patch, zero_frames, truncate, patch+zero_frames, ..."""
     corruption_mode: Mode = "resample"
-    """resample: drawn anew whenever a row enters a batch, as in the paper (where features are cached: once a view);
-    emission: a row is hidden in the same way each time it is read, in all runs of one seed."""
+    """resample: a row gets a new mask whenever it is sampled, as in the paper (with cached features: once per view);
+    emission: a row always gets the same mask, in all runs with the same seed."""
     stages: tuple[Options, ...] = ()
-    """One for every part of the name."""
+    """The stages, one per part of the name."""
 
     @classmethod
     def of(cls, corruption: str = "none", corruption_mode: Mode = "resample", **options: Any) -> Self:
-        """A corruption by name.
+        """Build a config by name, such as `CorruptionConfig.of("patch+zero_frames", patch_size=32)`.
 
         Args:
-            corruption: names of stages, joined by `+`.
+            corruption: stage names joined by `+`.
             corruption_mode: see the field.
             options: values of the stages' options by name.
 
         Raises:
-            UserError: an unknown or a repeated name, an option that no stage reads, or one that two of them have.
+            UserError: an unknown or repeated name, an option that no stage has, or one that two stages have.
         """
         config = cls.fill({"corruption": corruption, "corruption_mode": corruption_mode} | options)
         known = flat(config)
@@ -248,12 +251,12 @@ class CorruptionConfig(Options):
 
     @classmethod
     def fill(cls, values: Mapping[str, Any]) -> Self:
-        """The corruption that many values name, with its stages' options among them."""
+        """Build the config from flag values, including those of its stages' options; others are ignored."""
         stages = tuple(kind.fill(values) for kind in _kinds(values.get("corruption", "none")))
         return cls(**{name: values[name] for name in _OWN if name in values}, stages=stages)
 
     def check(self) -> None:
-        """Raise UserError for stages that are not the name's, and for values that cannot work."""
+        """Raise UserError if the stages do not match the name, or for invalid values."""
         if [type(stage) for stage in self.stages] != _kinds(self.corruption):
             raise UserError(
                 f"this config has other stages than {self.corruption!r} names, so it would do other things: make it by "
@@ -268,13 +271,13 @@ NO_CORRUPTION = CorruptionConfig()
 
 
 def corruption_settings(corruption: str) -> set[str]:
-    """Names of the settings that say how a corruption hides pixels, without those of stages that are not here."""
+    """Names of all settings of a corruption, such as patch_size; stages not installed here are skipped."""
     kinds = (STAGES[name] for name in corruption.split("+") if name in STAGES)
     return {*_OWN, *(field.name for kind in kinds for field in fields(kind))}
 
 
 class Corruption:
-    """Stages that change frames, and what makes whole frames of each stack 0."""
+    """A sequence of stages that modify frames, then optionally a `FrameDrop` that zeroes whole frames."""
 
     def __init__(self, stages: list[Stage], drop: FrameDrop | None = None) -> None:
         self._stages, self._drop = stages, drop
@@ -286,10 +289,10 @@ class Corruption:
 
         Args:
             obs: (..., C, H, W) uint8, C = 3 * stacked frames.
-            key: (...,) int64 on the same device, one a stack; equal keys give equal masks.
+            key: (...,) int64 on the same device, one per stack; equal keys give equal masks.
 
         Returns:
-            uint8 like `obs`; `obs` itself where there is nothing to do.
+            uint8 like `obs`; `obs` itself (no copy) if the corruption is "none".
 
         Raises:
             UserError: keys of another shape or dtype.
@@ -299,7 +302,7 @@ class Corruption:
         return self.apply_(obs.clone(memory_format=torch.contiguous_format), key)
 
     def apply_(self, obs: Tensor, key: Tensor) -> Tensor:
-        """The same in place, for a contiguous batch that is the caller's own."""
+        """Corrupt a contiguous batch in place; arguments and errors as `__call__`."""
         if self._nothing:
             return obs
         if key.shape != obs.shape[:-3] or key.dtype != torch.int64:
@@ -319,17 +322,17 @@ class Corruption:
         return obs
 
     def paint(self, frames: Tensor, index: Tensor, key: Tensor, shift_key: Tensor, pad: int) -> Tensor | None:
-        """Frames gathered, shifted and corrupted in one pass.
+        """Gather, shift and corrupt frames in one fused pass.
 
         Args:
             frames: (R, C, H, W) uint8.
-            index: (N, S) int64 of the frames of each stack.
-            key: (N,) int64, one a stack.
-            shift_key: (M,) int64, each for N / M stacks that follow one another.
-            pad: largest shift.
+            index: (N, S) int64, frame numbers of each stack.
+            key: (N,) int64 corruption keys, one per stack.
+            shift_key: (M,) int64 shift keys, each shared by N / M consecutive stacks.
+            pad: largest shift in pixels.
 
         Returns:
-            (N, S * C, H, W) uint8; None where there is nothing to change, or a stage that only knows whole stacks.
+            (N, S * C, H, W) uint8; None if nothing changes, or if a stage does not implement `Hiding`.
         """
         if not self._by_pixel or not len(index) or (self._nothing and not pad):
             return None
@@ -339,21 +342,20 @@ class Corruption:
         return painted(stages, frames, index, *made)
 
     def kept(self, key: Tensor, stack: int) -> Tensor:
-        """Numbers of the frames that are not zeroed, (N, K) int64, in stacks of `stack` frames with (N,) int64 keys."""
+        """Indices (N, K) int64 of the frames that are not zeroed, in stacks of `stack` frames with (N,) int64 keys."""
         if self._drop is None:
             return torch.arange(stack, device=key.device).expand(len(key), stack)
         dropped = self._drop.dropped(stack)
         return drop_order(self._drop, key, len(self._stages), stack).argsort(dim=1)[:, dropped:]
 
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
-        """Apply the stages, in place, to the (N, K, 3, H, W) frames that (N, K) `kept` names."""
+        """Apply the stages in place to (N, K, 3, H, W) frames, whose indices in their stacks are `kept` (N, K)."""
         for number, stage in enumerate(self._stages):
             stage(frames, derive_keys(number, key), kept)
 
 
 def make_corruption(config: CorruptionConfig | str) -> Corruption:
-    """Build a corruption from its config, or from its name with default options; an unknown name or a field
-    out of range raises UserError."""
+    """Build a corruption from its config, or from its name with default options; UserError if either is invalid."""
     if isinstance(config, str):
         config = CorruptionConfig.of(config)
     config.check()
@@ -363,16 +365,16 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
 
 
 def check_corruption_fits(config: CorruptionConfig, size: int = FRAME_SIZE) -> None:
-    """Raise UserError for a corruption that does not fit stacks of size x size pixels, before any is corrupted."""
+    """Raise UserError if a corruption cannot be applied to size x size frames, such as a patch larger than those."""
     stack = torch.zeros(1, _CHANNELS * FRAME_STACK, size, size, dtype=torch.uint8)
     make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))
 
 
 class BatchCorruption:
-    """A corruption with its source of keys, for batches of a data set.
+    """A corruption with a stream of random keys, for batches of a data set.
 
-    The keys come from a stream of their own, so that two methods with the same seed see identical masks. `name` tells
-    the streams of a run apart; under `emission` all of them share one, so that the same of a row is hidden.
+    The stream is separate from the method's, so that two methods with the same seed see identical masks. `name`
+    distinguishes the streams of a run. In `emission` mode they share one, so that a row always gets the same mask.
     """
 
     def __init__(self, config: CorruptionConfig | str, seed: int, *name: str | int) -> None:
@@ -382,11 +384,11 @@ class BatchCorruption:
         self.stream = KeyStream(stream_seed(seed, "corruption", *(["emission"] if self._emission else name)))
 
     def __call__(self, obs: Tensor, row_key: Tensor) -> Tensor:
-        """Corrupt, in place, contiguous (..., C, H, W) uint8 stacks whose rows are named by (...,) int64 `row_key`."""
+        """Corrupt contiguous (..., C, H, W) uint8 stacks in place; `row_key` (...,) int64 identifies their rows."""
         return self.corruption.apply_(obs, self.keys(row_key))
 
     def keys(self, row_key: Tensor) -> Tensor:
-        """What the next batch's rows, named by (...,) int64 `row_key`, are corrupted by: (...,) int64."""
+        """Corruption keys (...,) int64 for the next batch; `row_key` (...,) int64 identifies its rows."""
         if self._emission:
             return derive_keys(self.stream.seed, row_key)
         return self.stream.take(row_key.shape, row_key.device)

@@ -1,7 +1,7 @@
-"""Observations by one pass over their pixels, for a GPU: of which frame, shifted how far, hidden or not.
+"""Gather, shift and corrupt frames in one fused pass over the pixels, for a GPU.
 
-`drawn` gives a few numbers for every stack, `painted` every pixel by arithmetic on indices: a few kernels, if compiled.
-Masks, shifts and pixels are those of `Corruption.apply_` and `augmentation.random_shift`, which a CPU runs.
+`drawn` draws shift, dropped frames and patch positions of every stack; `painted` computes every pixel from them by
+index arithmetic. Compiled, that is a few kernels. The result equals the CPU's `random_shift` and `Corruption.apply_`.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from vd4rl_pomdp.corruptions.keys import derive_keys, hash_keys
 
 @runtime_checkable
 class Hiding(Protocol):
-    """A stage that can also say of a single pixel whether it hides it; others are applied to whole stacks."""
+    """A stage that can compute its mask pixel by pixel, so that it can be fused; others run on whole stacks."""
 
     @property
     def hidden_value(self) -> int:
-        """Value of the pixels that it hides, 0 to 255."""
+        """Value of hidden pixels, 0 to 255."""
 
     def places(self, key: Tensor, number: Tensor, height: int, width: int) -> Tensor:
-        """Where it hides pixels: (N, K, ...) numbers of whatever kind `hides` reads.
+        """Draw the parameters of the masks, (N, K, ...) in any form that `hides` reads, such as patch corners.
 
         Args:
-            key: (N,) int64, what to draw from.
-            number: (N, K) int64 place of each frame in its stack.
-            height: of a frame.
-            width: of a frame.
+            key: (N,) int64 random keys.
+            number: (N, K) int64 index of each frame in its stack.
+            height: frame height.
+            width: frame width.
         """
 
     def hides(self, places: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        """Whether pixels are hidden: (N, K, H, W) bool, given `places`, (H, 1) rows and (W,) columns, int64."""
+        """Mask (N, K, H, W) bool of hidden pixels, from `places` and int64 pixel rows (H, 1) and columns (W,)."""
 
 
 def tells_pixels(stage: Any) -> bool:
-    """Whether a stage is `Hiding`, and not by inheritance from one that does something else to frames."""
+    """Whether a stage is `Hiding`, and `hides` is not outdated by a subclass that overrides only `__call__`."""
     kinds = type(stage).__mro__
     tells, does = (
         next((i for i, kind in enumerate(kinds) if name in vars(kind)), len(kinds)) for name in ("hides", "__call__")
@@ -48,19 +48,19 @@ def tells_pixels(stage: Any) -> bool:
 
 
 class StackDraws(NamedTuple):
-    """What is drawn for N stacks of S frames."""
+    """Random draws for N stacks of S frames."""
 
     offset: Tensor | None
-    """(N, 2) int64, as `augmentation.draw_offset` has it; None: nothing is shifted."""
+    """(N, 2) int64 shifts from `augmentation.draw_offset`; None: no shift."""
     kept: Tensor | None
-    """(N, S) bool: frames that are not dropped; None: all are kept."""
+    """(N, S) bool, False for zeroed frames; None: all are kept."""
     places: tuple[Tensor, ...]
-    """One of each stage."""
+    """`Hiding.places` of each stage."""
 
 
 def drop_order(drop: Any, key: Tensor, stages: int, stack: int) -> Tensor:
-    """`FrameDrop.order` (N, stack) of stacks with (N,) keys, after so many stages."""
-    # A stream beside those of the stages, so that which frames are dropped tells nothing of where patches are.
+    """`FrameDrop.order` (N, stack) for (N,) keys, of a drop that follows `stages` stages."""
+    # A separate stream from the stages', so that dropped frames and patch positions are independent.
     return drop.order(hash_keys(derive_keys(stages, key) ^ 1), stack)
 
 
@@ -75,16 +75,16 @@ def drawn(
     stack: int,
     size: tuple[int, int],
 ) -> StackDraws:
-    """Draws for stacks of `stack` frames.
+    """Draw shifts, dropped frames and masks.
 
     Args:
-        stages: each `Hiding`.
-        drop: a `FrameDrop`, None for none.
-        dropped: frames of a stack that it drops.
-        pad: largest shift.
-        key: (N,) int64, what the corruption is drawn from.
-        shift_key: (M,) int64, what the shifts are drawn from, each for N / M stacks that follow one another.
-        stack: frames S of a stack.
+        stages: stages, each `Hiding`.
+        drop: a `FrameDrop` or None.
+        dropped: number of frames per stack that it drops.
+        pad: largest shift in pixels.
+        key: (N,) int64 corruption keys, one per stack.
+        shift_key: (M,) int64 shift keys, each shared by N / M consecutive stacks.
+        stack: frames S per stack.
         size: height and width of a frame.
     """
     offset = kept = None
@@ -93,7 +93,7 @@ def drawn(
     if dropped:
         draws, place = drop_order(drop, key, len(stages), stack), torch.arange(stack, device=key.device)
         one, other = draws[:, :, None], draws[:, None]
-        # ranks by comparison, equal draws in order: what sorting gives
+        # each frame's rank, by counting smaller draws; ties by position, like the stable sort on the CPU
         before = (other < one) | ((other == one) & (place < place[:, None]))
         kept = before.sum(2) >= dropped
     number = torch.arange(stack, device=key.device).expand(len(key), stack)
@@ -110,12 +110,12 @@ def painted(
     kept: Tensor | None,
     places: tuple[Tensor, ...],
 ) -> Tensor:
-    """Stacks (N, S * C, H, W) uint8, given what was `drawn` for them.
+    """Compute stacks (N, S * C, H, W) uint8 from the draws of `drawn`.
 
     Args:
-        stages: each `Hiding`.
+        stages: stages, each `Hiding`.
         frames: (R, C, H, W) uint8.
-        index: (N, S) int64 of the frames in each stack.
+        index: (N, S) int64, frame numbers of each stack.
         offset, kept, places: see `StackDraws`.
     """
     _, channels, height, width = frames.shape

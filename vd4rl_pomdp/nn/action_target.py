@@ -1,4 +1,4 @@
-"""Four ways to predict an action, behind one interface: what a head puts out and what it is compared with."""
+"""Action targets: four losses for predicting an action, behind one interface."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from vd4rl_pomdp.core.seeding import stream_seed
 
 
 class ActionTarget(Protocol):
-    """Turns head outputs and true actions into losses."""
+    """Loss between the action head's outputs and the true actions."""
 
     outputs: int
-    """Numbers the head must put out for each prediction."""
+    """Output size that the head needs."""
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
         """(..., outputs) and (..., A) -> (...,) losses, in nats or squared action units."""
 
 
 class KMeansTarget(nn.Module):
-    """Cross-entropy over the nearest of `codes` K-means centres of the training actions (the navigation lineage's)."""
+    """Cross-entropy on the nearest of `codes` K-means centres of the training actions (the default)."""
 
     def __init__(self, actions: np.ndarray, codes: int, seed: int) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class KMeansTarget(nn.Module):
 
 
 class BinsTarget(nn.Module):
-    """Cross-entropy over `bins` equal bins of [-1, 1] for each action dimension, averaged over dimensions."""
+    """Cross-entropy over `bins` equal bins of [-1, 1] per action dimension, averaged over dimensions."""
 
     def __init__(self, action_dim: int, bins: int) -> None:
         super().__init__()
@@ -80,16 +80,16 @@ ACTION_TARGETS = ("kmeans", "bins", "mse", "mse_l2")
 
 @dataclass(frozen=True)
 class CodeOptions(Options):
-    """Options of the targets that predict one of a number of codes."""
+    """Options of the discrete targets, kmeans and bins."""
 
     codes: int = 20
-    """K-means codes, or bins for each action dimension."""
+    """Number of K-means codes, or of bins per action dimension."""
 
     limits: ClassVar[Limits] = {"codes": 1}
 
 
 def target_options(name: str) -> type[Options]:
-    """Class of a target's options; an unknown name raises UserError listing the choices."""
+    """Options class of a target; UserError with the choices for an unknown name."""
     refuse_unknown("action target", name, ACTION_TARGETS)
     return CodeOptions if name in ("kmeans", "bins") else Options
 
@@ -99,9 +99,9 @@ def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) ->
 
     Args:
         name: kmeans, bins, mse or mse_l2.
-        actions: (N, A) float32 training actions, the only ones K-means is fitted on.
-        codes: K-means centres, or bins per dimension.
-        seed: the run's seed, which K-means starts from.
+        actions: (N, A) float32 training actions; K-means is fitted to them.
+        codes: number of K-means centres, or of bins per dimension; ignored by mse and mse_l2.
+        seed: the run's seed, for K-means.
     """
     if name == "kmeans":
         return KMeansTarget(actions, codes, seed)
@@ -111,18 +111,18 @@ def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) ->
 
 
 def _fit_centers(actions: np.ndarray, codes: int, seed: int) -> np.ndarray:
-    """K-means centres, (codes, A) float32, of at most 50,000 of the actions."""
+    """Fit K-means centres, (codes, A) float32, to at most 50,000 of the actions."""
     distinct = len(np.unique(actions, axis=0))
     if distinct < codes:
         raise UserError(f"the data set has {distinct} distinct actions, fewer than --codes {codes}: lower --codes")
     rng = np.random.default_rng(stream_seed(seed, "kmeans", "sample"))
     sample = actions if len(actions) <= 50_000 else actions[rng.choice(len(actions), 50_000, replace=False)]
-    start = stream_seed(seed, "kmeans", "centres") % 2**32  # the largest that scikit-learn takes
-    # a file by its path imports nothing of this package and not the caller's main module, and Ctrl-C is for the caller
+    start = stream_seed(seed, "kmeans", "centres") % 2**32  # scikit-learn accepts 32-bit seeds only
+    # Run as a script, it imports neither this package nor the caller's main module; a new session keeps Ctrl-C from it.
     program = [sys.executable, "-P", str(Path(__file__).with_name("codebook.py")), str(codes), str(start)]
     content = sample.astype(np.float64)
     if "sklearn" not in sys.modules:
-        with suppress(OSError, subprocess.SubprocessError):  # it is killed, or finds other packages than this process
+        with suppress(OSError, subprocess.SubprocessError):  # killed, or sklearn not importable there: fit in-process
             fitted = subprocess.run(
                 [*program, str(sample.shape[1])],
                 input=content.tobytes(),

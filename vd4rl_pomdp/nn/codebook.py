@@ -1,4 +1,4 @@
-"""K-means of actions by scikit-learn; run as a program, so that a training never holds the 110 MB of its import."""
+"""K-means on actions by scikit-learn; run as a subprocess, so that training does not keep sklearn's 110 MB loaded."""
 
 import sys
 
@@ -8,8 +8,8 @@ from threadpoolctl import threadpool_limits
 
 
 def fit_centers(sample: np.ndarray, codes: int, start: int) -> np.ndarray:
-    """Centres, (codes, A) float64, of (N, A) float64; `start` seeds scikit-learn's three beginnings."""
-    with threadpool_limits(1):  # not faster with more, and the last digits depend on their number
+    """K-means centres (codes, A) float64 of a (N, A) float64 sample; `start` seeds the three initialisations."""
+    with threadpool_limits(1):  # more threads are no faster, and the last digits depend on their number
         centers: np.ndarray = KMeans(codes, n_init=3, random_state=start).fit(sample).cluster_centers_
     return centers
 

@@ -1,4 +1,4 @@
-"""Random draws of an objective, as state: saved with it, so that a resumed training goes on with the same draws."""
+"""Random numbers for an objective whose position is part of its state_dict, so that a resumed run repeats no draw."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vd4rl_pomdp.corruptions.keys import next_keys
 
 
 class Draws(nn.Module):
-    """The stream called `name` of a run, as keys and numbers; its position is a buffer."""
+    """The random stream `name` of a run with seed `seed`; its position is a buffer."""
 
     def __init__(self, seed: int, *name: str) -> None:
         super().__init__()
@@ -23,10 +23,10 @@ class Draws(nn.Module):
         return next_keys(self.seed, self.position, shape)
 
     def integers(self, high: int | Tensor, *shape: int) -> Tensor:
-        """Uniform int64 in [0, high); a step that is replayed may tell `high` as a 0-d int64 tensor."""
+        """Uniform int64 in [0, high); `high` may be a 0-d int64 tensor, which CUDA graphs need if it varies."""
         return ((self.keys(*shape) >> 33 & 0x3FFFFFFF) * high) >> 30
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform float32 in (0, 1)."""
-        # 22 bits and a half are exact in float32, so neither 0 nor 1 is ever drawn.
+        # float32 holds 22 bits plus one half exactly, so neither 0 nor 1 is ever drawn.
         return ((self.keys(*shape) >> 33 & 0x3FFFFF).float() + 0.5) / 0x400000

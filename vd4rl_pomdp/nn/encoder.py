@@ -1,6 +1,6 @@
-"""The representation that is kept: a frame encoder and, for sequence methods, a memory of the past.
+"""The encoder: a frame encoder and, for sequence methods, a memory of the past.
 
-`encode` (whole windows) and `step` (one row at a time, as the environment delivers them) agree to float tolerance.
+`encode` (whole windows, for training) and `step` (one row at a time, for acting) agree to float tolerance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vd4rl_pomdp.nn.frame import STATE, FrameEncoder, StateFrame, make_frame_enc
 from vd4rl_pomdp.nn.memory import Memory, make_memory, run_memory
 
 Readout = Literal["state", "frame", "frame+state"]
-"""What of an encoder with a memory its representation is: s_t, e(o_t), or both one after the other."""
+"""Representation of an encoder with a memory: s_t, e(o_t), or both concatenated."""
 
 
 @dataclass(frozen=True)
@@ -30,95 +30,95 @@ class EncoderConfig:
     frame_encoder: str = "drq"
     feature_dim: int = 256
     history: str = "none"
-    """Name of the memory that makes s_t of rows 0..t; none: s_t = e(o_t)."""
+    """Name of the memory that computes s_t from rows 0..t; "none": s_t = e(o_t)."""
     use_actions: bool = False
-    """Whether the memory also reads a_{t-1} in row t."""
+    """Whether the memory also reads a_{t-1} at row t."""
     hidden_dim: int = 256
     history_window: int = 0
-    """Rows the state is computed from, 0 for all since the episode's start."""
+    """Number of most recent rows that s_t is computed from, including row t; 0: all since the episode's start."""
     readout: Readout = "state"
-    """What the representation is; other than s_t only after pretraining."""
+    """The representation that is returned; values other than "state" are set only after pretraining."""
     channels: int = 3 * FRAME_STACK
     """Channels of an observation."""
     size: int = FRAME_SIZE
     """Height and width of an observation."""
     frame_options: dict[str, Any] = field(default_factory=dict)
-    """What else the frame encoder was told, by name."""
+    """Other options of the frame encoder, by name."""
     memory_options: dict[str, Any] = field(default_factory=dict)
-    """What else the memory was told, by name."""
+    """Other options of the memory, by name."""
 
     @property
     def dim(self) -> int:
-        """Width of the representation."""
+        """Dimension of the representation."""
         widths = {"frame": self.feature_dim, "state": self.hidden_dim}
         return widths["frame"] if self.history == "none" else sum(widths[part] for part in self.readout.split("+"))
 
 
 @dataclass(frozen=True)
 class EncoderCard:
-    """Where an encoder comes from."""
+    """How an encoder was pretrained."""
 
     method: str
     task: str
     quality: str
     corruption: dict[str, Any]
-    """The corruption it was pretrained under, as the settings of CorruptionConfig."""
+    """The corruption of its pretraining, as CorruptionConfig fields."""
     seed: int
     steps: int
     preset: str
     end_to_end: str = ""
-    """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
+    """Fine-tuning algorithm that also trains the encoder; empty for a frozen encoder."""
     action_loss: float | None = None
-    """For methods that predict actions: the mean of the last tenth of the pretraining's rows of metrics.
+    """For methods that predict actions: mean action loss over the last tenth of the logged metric rows.
 
-    Each row is the mean over the steps since the row before; all count the same, also where they are of fewer steps.
+    Each row is the mean over the steps since the previous row; all rows have equal weight.
     """
     data: str = ""
-    """Fingerprint of the set it was pretrained on."""
+    """Fingerprint of the pretraining data set."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """The pretraining's settings without seed, folders, device and logging; empty if they were not recorded."""
+    """Pretraining config without seed, folders, device and logging; empty if not recorded."""
 
 
 @dataclass(frozen=True)
 class EncoderRecord:
-    """An encoder folder's config.json: what the encoder is and where it comes from.
+    """Contents of an encoder folder's config.json.
 
-    `encoder` and `pretrain` name it, with its weights; the same encoder may have other values of all else.
+    `encoder`, `pretrain` and the weights identify an encoder (`encoder_hash`); the other fields are informational.
     """
 
     encoder: EncoderConfig
     pretrain: EncoderCard
     version: str
-    """Version and commit of this package that wrote it."""
+    """Version (and commit, below) of the package that wrote it."""
     commit: str
     frames: int | None = None
-    """Frames that the pretraining's batches held; None: not recorded."""
+    """Number of frames in all pretraining batches; None: not recorded."""
     probe: dict[str, float] = field(default_factory=dict)
-    """Errors of linear probes, as `vd4rl_pomdp.nn.probes.probe_state` gives them; empty if none was fitted."""
+    """Linear probe errors from `nn.probes.probe_state`; empty if no probe was fitted."""
     plugins: dict[str, str] = field(default_factory=dict)
-    """Where parts come from that are not this package's, as `registry.code_of` tells."""
+    """Origin of the parts that come from other packages; see `registry.code_of`."""
     sources: dict[str, str] = field(default_factory=dict)
-    """Their files, as `registry.code_of` tells."""
+    """Source files of these parts; see `registry.code_of`."""
 
     @property
     def parts(self) -> dict[str, str]:
-        """Names of the parts that made it, by the registries' `setting`."""
+        """Names of the registered parts it was made with, keyed by setting, such as {"method": "mik+a", ...}."""
         card = self.pretrain
         named = {"method": card.method, "task": card.task, "corruption": card.corruption["corruption"]}
         return named | {"frame_encoder": self.encoder.frame_encoder, "history": self.encoder.history}
 
 
 class StreamState(NamedTuple):
-    """What an encoder remembers between rows."""
+    """State of an encoder between calls of `step`."""
 
     hidden: Tensor
-    """(L, B, W); empty for memoryless encoders, and not read under a history window."""
+    """(L, B, W) memory state; empty for memoryless encoders, unused with a history window."""
     rows: Tensor
-    """(B, L', F + A): the memory's last inputs under a history window, else empty."""
+    """(B, up to history_window, F + A): the memory's most recent inputs with a history window, else empty."""
 
 
 class Encoder(nn.Module):
-    """Maps observations and past actions to the representation s_t of width `dim`."""
+    """Maps observations and past actions to the representation s_t of dimension `dim`."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -139,45 +139,45 @@ class Encoder(nn.Module):
 
     @property
     def memory(self) -> Memory | None:
-        """What makes s_t of the rows up to t; its weights are called after it."""
+        """The memory, None for "none"; its weights are named after it, such as `gru.weight_ih_l0`."""
         return None if self.config.history == "none" else getattr(self, self.config.history)
 
     @property
     def _row_width(self) -> int:
-        """Width of what the memory reads at a row."""
+        """Input width of the memory."""
         return self.config.feature_dim + (self.config.action_dim if self.config.use_actions else 0)
 
     def make_memory(self, inputs: int) -> Memory:
-        """Another memory of the encoder's kind and options for rows of width `inputs`, such as one of the future."""
+        """New memory of the same kind and options for rows of width `inputs`, such as MIK's backward memory."""
         told = {"hidden_dim": self.config.hidden_dim} | self.config.memory_options
         return make_memory(self.config.history, inputs, told, self.config.feature_dim)
 
     @property
     def dim(self) -> int:
-        """Width of the representation."""
+        """Dimension of the representation."""
         return self.config.dim
 
     @property
     def remembers(self) -> bool:
-        """Whether the representation depends on rows before."""
+        """Whether the representation depends on earlier rows."""
         return self.memory is not None and self.config.readout != "frame"
 
     @property
     def reads_state(self) -> bool:
-        """Whether observations are simulator states (B, P, 1, 1) in place of pixels."""
+        """Whether observations are simulator states (B, P, 1, 1) instead of pixels."""
         return self.config.frame_encoder == STATE
 
     @property
     def frame_stack(self) -> int:
-        """Frames of an observation; 1 where its channels are not three a frame."""
+        """Number of frames in an observation; 1 if its channels are not RGB frames."""
         return 1 if self.reads_state or self.config.channels % 3 else self.config.channels // 3
 
     def encode(self, window: Windows) -> Tensor:
-        """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); raises UserError for other pictures."""
+        """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); UserError for another image shape."""
         self._refuse_other(window.obs)
         whole = self.config.readout == "state" and not self.config.history_window
         if self.memory is not None and self.memory.first_only and whole:
-            # the frame encoder's work on rows that are not read would be most of a step's
+            # only the first row's features are read: skip the frame encoder, most of a step's cost, on the others
             features = pad(self.frame(window.obs[:, :1]), (0, 0, 0, window.obs.shape[1] - 1))
         else:
             features = self.frame(window.obs)
@@ -192,13 +192,13 @@ class Encoder(nn.Module):
         if span == 0 or rows.shape[1] <= span:
             return self._read(features, run_memory(self.memory, rows)[0])
         first = run_memory(self.memory, rows[:, :span])[0]
-        # Every later state is computed anew from the last `span` rows, the row itself among them.
+        # Every later state is computed from the initial state over the last `span` rows, its own row included.
         recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)  # (B, T - span, span, I)
         later = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))[0][:, -1]
         return self._read(features, torch.cat([first, later.view(*recent.shape[:2], -1)], dim=1))
 
     def initial_state(self, batch: int) -> StreamState:
-        """State before an episode's first row."""
+        """State at the start of an episode."""
         weight = next(self.parameters())
         hidden, rows = weight.new_zeros(0), weight.new_zeros(0)
         if self.memory is not None:
@@ -218,7 +218,7 @@ class Encoder(nn.Module):
             (B, dim) representation, and the state for the next row.
 
         Raises:
-            UserError: pictures of another shape than it was built for.
+            UserError: images of another shape than the encoder was built for.
         """
         self._refuse_other(obs)
         features = self.frame(obs)
@@ -230,7 +230,7 @@ class Encoder(nn.Module):
         if span == 0:
             out, hidden = run_memory(self.memory, row, state.hidden)
             return self._read(features, out[:, 0]), state._replace(hidden=hidden)
-        # Under a window no hidden state is carried on: it would remember rows that have left the window.
+        # With a history window no hidden state is kept: it would remember rows that have left the window.
         rows = torch.cat([state.rows, row], dim=1)[:, -span:]
         newest = run_memory(self.memory, self._forget_first_action(rows))[0][:, -1]
         return self._read(features, newest), state._replace(rows=rows)
@@ -245,14 +245,14 @@ class Encoder(nn.Module):
             )
 
     def _read(self, features: Tensor, states: Tensor) -> Tensor:
-        """The representation, given e(o_t) (..., F) and s_t (..., H)."""
+        """The representation from e(o_t) (..., F) and s_t (..., H)."""
         return torch.cat([features, states], dim=-1) if self.config.readout == "frame+state" else states
 
     def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features
 
     def _forget_first_action(self, rows: Tensor) -> Tensor:
-        """A window's first row carries no earlier action."""
+        """Zero the previous action in a window's first row, as it precedes the window."""
         if not self.config.use_actions:
             return rows
         rows = rows.clone()

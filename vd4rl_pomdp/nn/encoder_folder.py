@@ -1,6 +1,6 @@
-"""A pretrained encoder is a folder: config.json and model.safetensors, loadable without the code that trained it.
+"""Save and load encoder folders: config.json and model.safetensors, loadable without the code that trained them.
 
-README.md beside them is a model card as the Hugging Face Hub reads it, told from config.json alone.
+The README.md in the folder is a Hugging Face model card, generated from config.json.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from vd4rl_pomdp.runs.provenance import git_commit
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 FILES_OF_RUN = (f"encoder/{CONFIG}", f"encoder/{WEIGHTS}")
-"""An encoder's files, below the folder of the run that made it."""
+"""An encoder's files, relative to the run folder."""
 LICENSE = "mit"
-"""What the package and V-D4RL's sets have."""
+"""Default licence: that of this package and of the V-D4RL data sets."""
 TAGS = ("reinforcement-learning", "offline-reinforcement-learning", "partial-observability", "representation-learning")
 
 
 def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:
-    """Write an encoder folder; whole files only, config last.
+    """Write an encoder folder; every file is written atomically, config.json last.
 
     Args:
-        folder: where.
-        encoder: its weights and config.
-        card: where it comes from.
-        frames: how many frames the batches of its pretraining held, if that is known.
+        folder: folder to write.
+        encoder: the encoder.
+        card: how it was pretrained.
+        frames: number of frames in all pretraining batches, if known.
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
@@ -51,7 +51,7 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
 
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
-    """Write all files, config.json last: without it the folder is no encoder folder."""
+    """Write all files, config.json last: without it a folder does not count as an encoder folder."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / WEIGHTS, weights)
@@ -60,24 +60,24 @@ def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
 
 
 def copy_encoder(source: Path, target: Path, changes: Mapping[str, Any]) -> None:
-    """Copy an encoder folder.
+    """Copy an encoder folder, changing fields of its config.
 
     Args:
         source: an encoder folder.
         target: folder to write.
-        changes: fields of the copy's `EncoderConfig` by name.
+        changes: new values of `EncoderConfig` fields, such as {"readout": "frame"}.
     """
     record = read_record(source)
     _write(target, replace(record, encoder=replace(record.encoder, **changes)), read_bytes(source / WEIGHTS))
 
 
 def tell_probe(folder: Path, errors: Mapping[str, float]) -> None:
-    """Add the errors of linear probes, as `EncoderRecord.probe` has them, to what an encoder folder says of itself."""
+    """Record linear probe errors (see `EncoderRecord.probe`) in an encoder folder's config.json and model card."""
     _write(folder, replace(read_record(folder), probe=dict(errors)), read_bytes(folder / WEIGHTS))
 
 
 def encoder_hash(folder: Path) -> str:
-    """Name of an encoder: equal for equal weights, network and pretraining, wherever it lies and whoever wrote it."""
+    """Hash of weights, architecture and pretraining settings; independent of path and package version."""
     record, weights = read_record(folder), hashlib.blake2b(read_bytes(folder / WEIGHTS))
     return content_hash([weights.hexdigest(), asdict(record.encoder), asdict(record.pretrain)])
 
@@ -85,16 +85,16 @@ def encoder_hash(folder: Path) -> str:
 def load_encoder(
     folder: Path | str, task: str | None = None, action_dim: int | None = None, size: int | None = None
 ) -> tuple[Encoder, EncoderCard]:
-    """Read an encoder folder into a frozen module in eval mode.
+    """Load an encoder folder as a frozen module in eval mode.
 
     Args:
         folder: written by `save_encoder`.
-        task: the task it will be used on, if that is to be checked.
-        action_dim: the action dimension it will be used with, if that is to be checked.
-        size: height and width of the pictures it will see, if that is to be checked.
+        task: if given, the task it must have been pretrained on.
+        action_dim: if given, the action dimension it must have.
+        size: if given, the image height and width it must have; not checked for state encoders.
 
     Raises:
-        UserError: the folder is missing, damaged, pickled, or of another task or image size.
+        UserError: the folder is missing, damaged or a pickle, or one of the checks fails.
     """
     folder = Path(folder)
     record = read_record(folder)
@@ -115,7 +115,7 @@ def load_encoder(
             f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task"
         )
     try:
-        with fork_rng(devices=[]):  # weights that are drawn here are read over
+        with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
             encoder = Encoder(encoder_config)
         CorruptionConfig.of(**card.corruption).check()
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
@@ -136,7 +136,7 @@ def load_encoder(
 
 
 def read_record(folder: Path) -> EncoderRecord:
-    """An encoder folder's config.json; raises UserError if there is none, a damaged one, or a pickle in its place."""
+    """Read an encoder folder's config.json; UserError if it is missing or damaged, or the folder holds a pickle."""
     with disk_errors(folder):
         pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
     if pickles and not (folder / WEIGHTS).exists():
@@ -155,12 +155,12 @@ def read_record(folder: Path) -> EncoderRecord:
 
 
 def model_card(record: EncoderRecord, repository: str = "", license: str = LICENSE) -> str:
-    """Text of the card.
+    """Text of the model card, README.md.
 
     Args:
         record: an encoder folder's config.json.
-        repository: OWNER/NAME on the Hub from which the card's code loads it; empty: from the card's own folder.
-        license: the licence that its owner gives it, as the Hub spells it; empty: the card names none.
+        repository: OWNER/NAME on the Hub, for the loading example; empty: the example loads the card's own folder.
+        license: Hub identifier of the licence, such as "mit"; empty: none.
     """
     card, shape = record.pretrain, record.encoder
     if card.end_to_end:
@@ -217,5 +217,5 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
 
 
 def front_matter(values: dict[str, Any]) -> list[str]:
-    """YAML, its texts as JSON has them, which is YAML, too."""
+    """YAML front matter of a Hub card; values are written as JSON, which is valid YAML."""
     return ["---", *(f"{name}: {json.dumps(value)}" for name, value in values.items()), "---"]

@@ -1,4 +1,4 @@
-"""Frame encoders e(o): convolutions on one stacked observation, then Linear, LayerNorm, Tanh."""
+"""Frame encoders e(o): convolutions on one frame stack, then Linear, LayerNorm, Tanh."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ class FrameOptions(Options):
     """Options of every frame encoder."""
 
     feature_dim: int = 256
-    """Width of the frame encoder's output."""
+    """Dimension of the frame encoder's output."""
 
     limits: ClassVar[Limits] = {"feature_dim": 1}
 
 
 def encoder_settings(options: Options) -> dict[str, Any]:
-    """What `EncoderConfig` is told of a frame encoder's options: `feature_dim`, and as `frame_options` all others."""
+    """Split a frame encoder's options into the `EncoderConfig` fields `feature_dim` and `frame_options` (the rest)."""
     told = asdict(options)
     return {"feature_dim": told.pop("feature_dim"), "frame_options": told}
 
 
 @dataclass(frozen=True)
 class FrameEncoderPart:
-    """How to build what comes before a frame encoder's last layer."""
+    """How to build a frame encoder's convolutions; `FrameEncoder` adds Linear, LayerNorm and Tanh."""
 
     build: Callable[[int, int, Any], nn.Module]
-    """From channels and size of a picture, and options: a module (N, C, size, size) -> (N, C', H', W'), of pixels in
-    [-0.5, 0.5]; a linear layer, a layer norm and a tanh follow. What the module finds out when it is built, such as
-    which weights a name stands for, is its attribute `found`: values of options, which the encoder's record keeps."""
+    """Called with (channels, size, options); returns a module (N, C, size, size) -> (N, C', H', W') of pixels in
+    [-0.5, 0.5]. Its optional attribute `found` is a dict of option values known only after building, such as the hash
+    of the weights that a model name stands for; the encoder's config records them."""
     options: type[FrameOptions] = FrameOptions
     """Class of its options."""
     summary: str = ""
-    """One line that says what it is."""
+    """One-line description."""
 
 
 class FrameEncoder(nn.Module):
@@ -75,7 +75,7 @@ class FrameEncoder(nn.Module):
         return _features(self, obs, self._precision(obs))
 
     def maps(self, obs: Tensor) -> Tensor:
-        """Feature maps (..., C', H', W') of every stack, the layer before `from_maps`."""
+        """Feature maps (..., C', H', W') of every stack, the input of `from_maps`."""
         return _maps(self, obs, self._precision(obs))
 
     def from_maps(self, maps: Tensor) -> Tensor:
@@ -84,13 +84,13 @@ class FrameEncoder(nn.Module):
         return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
 
     def _precision(self, obs: Tensor) -> torch.dtype:
-        """What pixels are converted to."""
+        """Dtype that pixels are converted to."""
         if torch.is_autocast_enabled(obs.device.type):
-            return torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor
+            return torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor in memory
         return next(self.project.parameters()).dtype
 
 
-# functions, not methods: what was compiled must not go along where an encoder is copied
+# functions, not methods: deepcopy of an encoder must not copy compiled code
 @compiled_on_gpu(training=True)
 def _maps(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
     pixels = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
@@ -104,7 +104,7 @@ def _features(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _rectified(channels: int, *shapes: tuple[int, int, int]) -> list[nn.Module]:
-    """Rectified convolutions by output channels, extent and stride."""
+    """Convolutions with ReLU; each shape is (output channels, kernel size, stride)."""
     layers: list[nn.Module] = []
     for width, extent, stride in shapes:
         layers += [nn.Conv2d(channels, width, extent, stride=stride), nn.ReLU()]
@@ -123,13 +123,13 @@ def _nature(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
 
 
 def _nature_half(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """The same at half the resolution: means over 2x2 pixels, which a first convolution of half the extent reads."""
+    """Nature at half resolution: 2x2 average pooling, then a first convolution with half the kernel size and stride."""
     half = nn.AvgPool2d(2, ceil_mode=True)
     return nn.Sequential(half, *_rectified(channels, (32, 4, 2), (64, 4, 2), (64, 3, 1)))
 
 
 def _small(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """Three strided convolutions of 16 to 32 channels, for grey 50x50 pictures on a CPU."""
+    """Three strided convolutions of 16 to 32 channels, for grey 50x50 images on a CPU."""
     return nn.Sequential(*_rectified(channels, (16, 5, 2), (32, 3, 2), (32, 3, 2)))
 
 
@@ -178,7 +178,7 @@ def _mixer(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
 
 
 def _flat(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """No convolution: for observations that are a handful of numbers, as in finite worlds."""
+    """No convolution, for observations of a few numbers, as in the finite worlds of the theory study."""
     return nn.Sequential()
 
 
@@ -187,26 +187,26 @@ class PretrainedOptions(FrameOptions):
     """Options of a frozen image model."""
 
     model: str = "facebook/dinov2-small"
-    """Name of a model in transformers' cache on this machine, or a folder that its save_pretrained wrote."""
+    """Model in transformers' local cache, or a folder written by save_pretrained."""
     model_size: int = 224
-    """Height and width to which frames are resized for it."""
+    """Height and width to which frames are resized."""
     weights: str = ""
-    """Content hash that its weights must have; empty: any, and the encoder's record tells which they were."""
+    """Required content hash of the model's weights; empty: any. The hash used is recorded in the encoder's config."""
 
     limits: ClassVar[Limits] = {"model_size": (1, 4096)}
 
 
 def _pretrained(channels: int, size: int, options: PretrainedOptions) -> Pretrained:
-    """Frozen features of each frame by a model of transformers; the linear layer behind them is trained."""
+    """Frozen features of each frame from a transformers model; only the linear layer after them is trained."""
     return Pretrained(options.model, options.model_size, options.weights, channels)
 
 
 STATE = "state"
-"""Frame encoder of the `state` reference, which is no part: it reads no pixels."""
+"""Value of --frame-encoder for simulator states; not in FRAME_ENCODERS, since it reads no pixels."""
 
 
 def _refuse_part(name: str, part: FrameEncoderPart) -> None:
-    """Raise UserError for a frame encoder that could not be told from another, or whose options cannot work."""
+    """Raise UserError for a frame encoder with a reserved name or invalid options."""
     if name == STATE:
         raise UserError("encoders of simulator states have this name: choose another")
     refuse_options(part.options, FrameOptions)
@@ -233,11 +233,11 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     "a vd4rl_pomdp.nn.frame.FrameEncoderPart",
     _refuse_part,
 )
-"""All frame encoders. Packages offer theirs in the group of entry points `vd4rl_pomdp.frame_encoders`."""
+"""All frame encoders. Other packages add theirs through the entry point group `vd4rl_pomdp.frame_encoders`."""
 
 
 class StateFrame(nn.Module):
-    """Hands the simulator state through, in place of pixels: (..., P, 1, 1) -> (..., P) float32."""
+    """Returns the simulator state, given instead of pixels, as features: (..., P, 1, 1) -> (..., P) float32."""
 
     noise: Tensor
     mean: Tensor
@@ -251,16 +251,16 @@ class StateFrame(nn.Module):
         std: Sequence[float] = (),
         hidden_share: float = 0.0,
     ) -> None:
-        """See the class.
+        """Initialise.
 
         Args:
-            width: coordinates P of a state.
-            noise: standard deviation of the noise that is added to each coordinate; empty for none.
-            mean, std: of each coordinate, which is standardised; empty: states stay as they are.
-            hidden_share: probability with which a coordinate is set to zero, its mean.
+            width: number of coordinates P.
+            noise: standard deviation of the noise added to each coordinate; empty: no noise.
+            mean, std: statistics that standardise each coordinate; empty: states are not standardised.
+            hidden_share: probability of setting a coordinate to zero, its standardised mean.
 
         Raises:
-            ValueError: numbers of another width.
+            ValueError: noise, mean or std is neither empty nor of length P.
         """
         super().__init__()
         for values in (noise, mean, std):
@@ -270,13 +270,13 @@ class StateFrame(nn.Module):
         for name, values in (("noise", noise), ("mean", mean), ("std", std)):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
         self.nothing = nn.Parameter(torch.zeros(0))
-        """Optimisers and files want one."""
+        """Optimisers need at least one parameter, and weight files one tensor."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """The state itself.
+        """Features (..., P) float32: the state itself.
 
         Raises:
-            UserError: it has another width, as those of earlier versions have.
+            UserError: the state has another width, as in earlier versions.
         """
         if obs.shape[-3] != self.width:
             raise UserError(
@@ -287,15 +287,15 @@ class StateFrame(nn.Module):
 
     @property
     def draws(self) -> bool:
-        """Whether what is observed of a state depends on a key."""
+        """Whether `observe` is random, so that its result depends on the key."""
         return len(self.noise) > 0 or self.hidden_share > 0
 
     def observe(self, state: Tensor, key: Tensor) -> Tensor:
-        """Observations of states.
+        """Turn states into observations: add noise, standardise, hide coordinates.
 
         Args:
             state: (..., P) float32.
-            key: (...,) int64, what noise and hidden coordinates are drawn from; equal keys give equal ones.
+            key: (...,) int64 keys of the random draws; equal keys give equal noise and hidden coordinates.
 
         Returns:
             (..., P, 1, 1) float32.
@@ -311,10 +311,10 @@ class StateFrame(nn.Module):
 
 
 def make_frame_encoder(name: str, channels: int, size: int, settings: Mapping[str, Any]) -> FrameEncoder:
-    """Build a frame encoder by name for pictures (channels, size, size), with values of its options.
+    """Build a frame encoder by name for images (channels, size, size); `settings` are its options by name.
 
     Raises:
-        UserError: an unknown name or option, a module that makes no maps, or cannot read pictures of this size.
+        UserError: an unknown name or option, or a module that cannot read images of this size or returns no maps.
     """
     part = FRAME_ENCODERS.named(name)
     options = part.options.fill(settings)

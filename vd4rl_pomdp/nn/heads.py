@@ -1,4 +1,4 @@
-"""Prediction heads on pairs of representations, perceptrons, InfoNCE, and targets that creep behind networks."""
+"""Prediction heads on pairs of representations, MLPs, InfoNCE, and Polyak-averaged target networks."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from vd4rl_pomdp.core import buffers
 
 _IGNORED = -100
-"""In the place of an anchor's candidate, where the anchor does not count."""
+"""Label of anchors that cross-entropy ignores."""
 
 
 class PairHead(nn.Module):
-    """An MLP of (s_t, g_{t+k}, k) for many pairs at once.
+    """An MLP on (s_t, g_{t+k}, k) for many pairs at once.
 
-    The first layer is a sum of three terms, so each row goes through it once however many pairs it is part of.
+    The first layer is a sum of one term per input, so it runs once per row, not once per pair.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class PairHead(nn.Module):
         Args:
             past: (B, T, past_dim).
             future: (B, T, future_dim).
-            pairs: (P, 2) int64 rows of (t, k).
+            pairs: (P, 2) int64, each (t, k).
 
         Returns:
             (B, P, outputs).
@@ -49,7 +49,7 @@ class PairHead(nn.Module):
 
 
 class ExactLinear(nn.Linear):
-    """A linear layer in its own precision, also inside autocast: for outputs that differences are taken of."""
+    """A linear layer with autocast disabled, for outputs whose small differences matter."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) -> (..., outputs)."""
@@ -58,7 +58,7 @@ class ExactLinear(nn.Linear):
 
 
 def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2, last: type[nn.Linear] = nn.Linear) -> nn.Sequential:
-    """Rectified MLP with `layers` hidden layers and a last layer of the given kind."""
+    """ReLU MLP with `layers` hidden layers and a last layer of the given class."""
     widths = [inputs] + [hidden] * layers
     modules: list[nn.Module] = []
     for a, b in pairwise(widths):
@@ -68,21 +68,21 @@ def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2, last: type[nn.L
 
 @cache
 def all_pairs(rows: int, max_k: int) -> Tensor:
-    """Every (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t; not to be changed."""
+    """All (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t; cached, do not modify."""
     pairs = [(t, k) for k in range(1, min(max_k, rows - 1) + 1) for t in range(rows - k)]
     return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)
 
 
 def info_nce(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
-    """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of telling each anchor's own candidate.
+    """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of identifying each anchor's positive.
 
     Args:
-        scores: (..., N, N), anchors by candidates; the diagonal holds the true pairs.
-        group: (N,) int64; the other candidates of an anchor's own group are no negatives. None: all others are.
-        real: (N,) bool; the others are neither anchors nor candidates. None: all are.
+        scores: (..., N, N), anchors by candidates; positives are on the diagonal.
+        group: (N,) int64; candidates of the anchor's own group are not used as negatives. None: all are.
+        real: (N,) bool; rows where it is False are neither anchors nor candidates. None: all count.
 
     Returns:
-        Mean over anchors and leading dimensions, in nats. It is log(candidates) when scores tell nothing.
+        Mean over anchors and leading dimensions, in nats; log(number of candidates) for constant scores.
     """
     real = _unless_all(real)
     logits = _logits(scores, group, real)
@@ -94,7 +94,7 @@ def info_nce(scores: Tensor, group: Tensor | None = None, real: Tensor | None = 
 
 
 def share_found(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
-    """Share of anchors whose own candidate scores highest among those that `info_nce` counts; the same arguments."""
+    """Accuracy: share of anchors whose positive scores highest among their candidates; arguments as `info_nce`."""
     truth = torch.arange(scores.shape[-1], device=scores.device)
     real = _unless_all(real)
     found = (_logits(scores, group, real).argmax(-1) == truth).float()
@@ -102,16 +102,16 @@ def share_found(scores: Tensor, group: Tensor | None = None, real: Tensor | None
 
 
 def _unless_all(real: Tensor | None) -> Tensor | None:
-    """None where all are real, if that can be seen without waiting for a GPU."""
+    """None if all are real; a mask on a GPU is kept, as reading it would synchronise."""
     return None if real is not None and buffers.in_host_memory(real) and real.all() else real
 
 
 def _logits(scores: Tensor, group: Tensor | None, real: Tensor | None) -> Tensor:
-    """Scores in float32; -inf where a candidate is no negative."""
+    """Scores in float32, -inf for excluded candidates."""
     logits = scores.float()
     if group is None and real is None:
         return logits
-    # its own stays, also where an anchor is not real: over nothing but -inf a softmax would have no gradient
+    # keep the positive of anchors that are not real, too: a softmax over only -inf has NaN gradients
     own = torch.eye(scores.shape[-1], dtype=torch.bool, device=scores.device)
     if group is not None:
         logits = logits.masked_fill((group[:, None] == group[None, :]) & ~own, -torch.inf)
@@ -122,5 +122,5 @@ def _logits(scores: Tensor, group: Tensor | None, real: Tensor | None) -> Tensor
 
 @torch.no_grad()
 def move_target(target: nn.Module, online: nn.Module, tau: float) -> None:
-    """Move a target's parameters by the share `tau` of the way to those of its network."""
+    """Polyak update: target <- (1 - tau) * target + tau * online."""
     torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), tau)

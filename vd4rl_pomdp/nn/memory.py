@@ -1,6 +1,6 @@
-"""Memories: what reads rows one after the other, forwards over the past and backwards over the future of a window.
+"""Memories: sequence models that run forwards over a window's past, or backwards over its future.
 
-Behind a frame encoder it makes s_t of the features of rows 0..t and, in methods with "+a", the actions before them.
+After a frame encoder, a memory computes s_t from the features of rows 0..t and, in "+a" methods, the previous actions.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ class MemoryPart:
     """How to build a memory."""
 
     build: Callable[[int, Any], Memory]
-    """From the width I of a row, and options. A memory's class is one."""
+    """Called with (input width I, options); usually the memory's class."""
     options: type[MemoryOptions] = MemoryOptions
     """Class of its options."""
     summary: str = ""
-    """One line that says what it is."""
+    """One-line description."""
 
 
 def _refuse_part(name: str, part: MemoryPart) -> None:
-    """Raise UserError for a memory that no setting could name, or whose options cannot work."""
+    """Raise UserError for a memory with a reserved name or invalid options."""
     if name in ("none", "method"):
         raise UserError("--history has this word for something else: choose another name")
     refuse_options(part.options, MemoryOptions)
@@ -75,17 +75,17 @@ MEMORIES: Registry[MemoryPart] = Registry(
     setting="history",
     group="vd4rl_pomdp.memories",
 )
-"""All memories. Packages offer theirs in the group of entry points `vd4rl_pomdp.memories`."""
+"""All memories. Other packages add theirs through the entry point group `vd4rl_pomdp.memories`."""
 
 
 def make_memory(name: str, inputs: int, settings: Mapping[str, Any], features: int | None = None) -> Memory:
-    """Build a memory by name for rows of a width; a name or a setting that is unknown raises UserError.
+    """Build a memory by name; UserError for an unknown name or option.
 
     Args:
-        name: of the memory in MEMORIES.
-        inputs: width of a row.
-        settings: values of its options.
-        features: how many of a row's numbers, the first ones, are the observation's; None: all.
+        name: name in MEMORIES.
+        inputs: width I of an input row.
+        settings: values of its options by name.
+        features: the first `features` inputs of a row are the observation's, the rest the action's; None: all.
     """
     part = MEMORIES.named(name)
     options = part.options.fill(settings)
@@ -99,7 +99,7 @@ def make_memory(name: str, inputs: int, settings: Mapping[str, Any], features: i
 
 
 def run_memory(memory: Memory, x: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Run a memory in its own precision, also inside autocast: (B, T, I) -> (B, T, H), and its state after that."""
+    """Run a memory with autocast disabled: (B, T, I) -> outputs (B, T, H) and the final state; no state: from zero."""
     if state is None:
         state = memory.initial_state(len(x))
     with torch.autocast(x.device.type, enabled=False):
@@ -115,22 +115,22 @@ def run_backward(memory: Memory, x: Tensor, length: Tensor) -> Tensor:
         length: (B,) int64.
 
     Returns:
-        (B, T, H): row j has seen rows j..length-1. Padding rows mean nothing and must not be used.
+        (B, T, H): output j depends on rows j..length-1. Outputs at padding rows are meaningless.
     """
     rows = torch.arange(x.shape[1], device=x.device)
     flip = length[:, None] - 1 - rows
-    flip = torch.where(flip >= 0, flip, rows)  # padding stays behind the real rows
-    # The same permutation puts the states back: flipping twice changes nothing.
+    flip = torch.where(flip >= 0, flip, rows)  # padding stays after the real rows
+    # The permutation is its own inverse, so it also restores the order of the outputs.
     out, _ = run_memory(memory, _take_rows(x, flip))
     return _take_rows(out, flip)
 
 
 def run_over_next(memory: Memory, x: Tensor, length: Tensor, span: int) -> Tensor:
-    """Like `run_backward`, but row j has seen rows j..j+span-1 alone: each state is computed anew from zero."""
+    """Like `run_backward`, but output j depends on rows j..j+span-1 only, computed from the initial state."""
     batch, rows, width = x.shape
     span = min(span, rows)
     j = torch.arange(rows, device=x.device)
-    count = (length[:, None] - j).clamp(1, span)  # padding rows read themselves
+    count = (length[:, None] - j).clamp(1, span)  # rows read for each j; a padding row reads itself
     index = (j[:, None] + count[..., None] - 1 - torch.arange(span, device=x.device)).maximum(j[:, None])
     windows = _take_rows(x, index.view(batch, -1)).view(batch * rows, span, width)
     out, _ = run_memory(memory, windows)
@@ -139,13 +139,15 @@ def run_over_next(memory: Memory, x: Tensor, length: Tensor, span: int) -> Tenso
 
 
 def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor, span: int | None = None) -> Tensor:
-    """Like `run_backward`, or `run_over_next` if there is a span, with rows that differ by the state they are read for.
+    """Like `run_backward` (or `run_over_next` with a span), but a row's input depends on the state that reads it.
+
+    With MIK's `future_frames`, V = 3: state j reads row j with 1 frame, row j+1 with 2, and later rows with all 3.
 
     Args:
         memory: reads rows backwards.
-        versions: V tensors (B, T, I); the state of row j reads row j+i in version i, or V-1 if that is less.
+        versions: V tensors (B, T, I); state j reads row j+i from versions[min(i, V-1)].
         length: (B,) int64.
-        span: rows that a state reads; None: all to the window's end.
+        span: rows per state; None: all up to the window's end.
 
     Returns:
         (B, T, H).
@@ -154,7 +156,7 @@ def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor
     batch, rows, _ = versions[0].shape
     state = memory.initial_state(batch)
     states, outputs = [state] * (rows + last), list[Tensor]()
-    if span is None:  # from row j+V-1 on all states read the same rows, so one pass over these serves them
+    if span is None:  # from row j+V-1 on all states read the same inputs, so they share one backward pass
         for j in reversed(range(rows)):
             output, ahead = run_memory(memory, versions[last][:, j, None], state)
             states[j] = state = torch.where((j < length)[:, None], ahead, state)
@@ -163,7 +165,7 @@ def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor
     else:
         own = min(span, rows)
     state = torch.stack(states[last:], dim=2).flatten(1, 2)
-    output = torch.cat(outputs, dim=1) if outputs else state  # of the last row read, which the loop replaces
+    output = torch.cat(outputs, dim=1) if outputs else state  # a placeholder; the loop below replaces it
     real = torch.arange(rows, device=length.device) < length[:, None]
     for i in reversed(range(own)):
         x = pad(versions[min(i, last)][:, i:], (0, 0, 0, min(i, rows)))
@@ -174,5 +176,5 @@ def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor
 
 
 def _take_rows(x: Tensor, index: Tensor) -> Tensor:
-    """Rows of (B, T, I) in the order given by (B, T) indices."""
+    """Gather rows of (B, T, I) by (B, T') indices: (B, T', I)."""
     return x.gather(1, index[..., None].expand(-1, -1, x.shape[2]))

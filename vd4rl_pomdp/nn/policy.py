@@ -1,4 +1,4 @@
-"""The policy on frozen representations: standardise, MLP, tanh. Saved as a folder that evaluation reads on its own."""
+"""Policy on frozen representations: standardise, MLP, tanh. It is saved as a self-contained folder."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 _WEIGHTS, _SHAPE = "model.safetensors", "config.json"
 _NO_POLICY = "not a policy folder", "`vd4rl-pomdp finetune` writes one as RUN/policy"
 _STEP = "step"
-"""Metadata of the weights' file."""
+"""Metadata key for the training step in the weights file."""
 
 
 class Standardise(nn.Module):
-    """Subtract the training features' mean and divide by their standard deviation + 1e-3, dimension by dimension."""
+    """Per dimension, subtract the training features' mean and divide by their standard deviation + 1e-3."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -32,11 +32,11 @@ class Standardise(nn.Module):
         self.std: Tensor
 
     def fit(self, features: Tensor) -> None:
-        """Take the statistics of (..., dim) features, in slices that keep memory small."""
+        """Compute the statistics of (..., dim) features, in chunks to save memory."""
         flat = features.view(-1, features.shape[-1])
         total = squares = torch.zeros_like(self.mean, dtype=torch.float64)
         for part in flat.split(65_536):
-            # Float32 sums over a whole set lose the digits that a small deviation is made of.
+            # Float32 sums over a whole data set are too inexact for small standard deviations.
             values = part.double()
             total, squares = total + values.sum(0), squares + values.square().sum(0)
         mean = total / len(flat)
@@ -66,7 +66,7 @@ class Policy(nn.Module):
         return torch.tanh(self.net(z))
 
     def save(self, folder: Path | str, step: int | None = None) -> None:
-        """Write the policy folder; with the weights goes the training step that they are of, if it is told."""
+        """Write the policy folder; if given, the training step `step` is stored with the weights."""
         folder = Path(folder)
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -79,7 +79,7 @@ def load_policy(folder: Path | str) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
     folder = Path(folder)
     try:
-        with fork_rng(devices=[]):  # weights that are drawn here are read over
+        with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
             policy = Policy(**read_json(folder / _SHAPE))
         policy.load_state_dict(read_tensors(folder / _WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
@@ -88,7 +88,7 @@ def load_policy(folder: Path | str) -> Policy:
 
 
 def policy_step(folder: Path) -> int | None:
-    """The training step of a policy folder's weights, None if they do not tell it; UserError as `load_policy`."""
+    """Training step stored with a policy folder's weights, None if there is none; UserError as `load_policy`."""
     with damaged(folder, *_NO_POLICY):
         told = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
         return None if told is None else int(told)

@@ -1,4 +1,4 @@
-"""Frozen image models that transformers knows by name, such as DINOv2: read from this machine, never downloaded."""
+"""Frozen image models from transformers, such as DINOv2; loaded from the local cache or a folder, never downloaded."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from torch.random import fork_rng
 from vd4rl_pomdp.core.errors import UserError, first_line
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's, by which DINOv2, DINOv3 and R3M want pictures standardised."""
+"""ImageNet statistics; DINOv2, DINOv3 and R3M expect images standardised by them."""
 AT_ONCE = 256
-"""Frames that go through the model together, for memory's sake."""
+"""Batch size in frames, which bounds memory."""
 
 
 class Pretrained(nn.Module):
-    """Each frame of a stack through a frozen model: (N, 3 S, H, W) in [-0.5, 0.5] -> (N, S D, 1, 1).
+    """Applies a frozen model to each frame of a stack: (N, 3 S, H, W) in [-0.5, 0.5] -> (N, S D, 1, 1).
 
-    A frame's features are the model's pooled output, or its first token where it pools nothing.
+    A frame's features are the model's pooled output or, if the model has none, its first token.
     """
 
     mean: Tensor
@@ -32,13 +32,13 @@ class Pretrained(nn.Module):
         """Load the model.
 
         Args:
-            name: of a model in transformers' cache, or a folder that its `save_pretrained` wrote.
+            name: a model in transformers' cache, or a folder written by `save_pretrained`.
             size: height and width to which frames are resized, bilinearly.
-            weights: content hash that the model's weights must have; empty: any.
-            channels: of a stack.
+            weights: required content hash of the model's weights; empty: any.
+            channels: channels of a stack, 3 per frame.
 
         Raises:
-            UserError: transformers or the model is missing, it has other weights, or the channels are no frames.
+            UserError: transformers or the model is missing, the weights differ, or channels is not a multiple of 3.
         """
         super().__init__()
         if channels % 3:
@@ -49,14 +49,14 @@ class Pretrained(nn.Module):
             raise UserError(
                 f"--model {name}: its weights are {found} by content, not {weights}: name the folder of those"
             )
-        # In a list it is no part of this module: it is neither trained nor saved, and stays in eval mode.
+        # In a list it is not a submodule: it is neither trained nor saved, and stays in eval mode.
         self._model = [model]
         self.size, self.found = size, {"weights": found}
         for key, values in (("mean", MEAN), ("std", STD)):
             self.register_buffer(key, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(self, image: Tensor) -> Tensor:
-        """See the class."""
+        """Features of every stack; see the class."""
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
         frames = (frames + 0.5 - self.mean) / self.std
         features = []
@@ -67,12 +67,12 @@ class Pretrained(nn.Module):
         return torch.cat(features).reshape(len(image), -1, 1, 1)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        self._model[0]._apply(fn)  # it goes to a device, or another precision, with what it is no part of
+        self._model[0]._apply(fn)  # not a submodule, so move it along in .to(), .cuda(), .half()
         return super()._apply(fn, recurse)
 
 
 def _load(name: str) -> Any:
-    """A model in eval mode, without gradients, float32."""
+    """Load a model in float32 and eval mode, without gradients."""
     try:
         import transformers
     except ImportError as error:
@@ -82,7 +82,7 @@ def _load(name: str) -> Any:
     transformers.utils.logging.disable_progress_bar()
     local: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "dtype": torch.float32}
     try:
-        with fork_rng(devices=[]):  # what is drawn before the weights are read is read over
+        with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
             model = transformers.AutoModel.from_pretrained(name, **local)
     except (OSError, ValueError) as error:
         raise UserError(
@@ -93,7 +93,7 @@ def _load(name: str) -> Any:
 
 
 def _content(model: nn.Module) -> str:
-    """Hash of a model's weights, wherever they lie: 32 characters."""
+    """Content hash of a model's weights: 32 hex digits."""
     found = hashlib.blake2b(digest_size=16)
     for name, value in sorted(model.state_dict().items()):
         found.update(f"{name} {tuple(value.shape)}".encode())

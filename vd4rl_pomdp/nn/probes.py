@@ -1,6 +1,6 @@
-"""What a frozen representation says of the simulator state: a linear probe on held-out episodes.
+"""Linear probes: how well a frozen representation predicts the simulator state on held-out episodes.
 
-Held out from the probe, not from pretraining: an encoder that was trained on the states themselves knew these, too.
+Episodes are held out from the probe only, not from pretraining: `supervised` may have trained on their states.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from vd4rl_pomdp.core.state_scale import LEAST_VARIANCE
 from vd4rl_pomdp.core.tasks import Layout
 
 HELD_OUT = 5
-"""Every fifth episode is for testing; of fewer than five, the last."""
+"""Every fifth episode is a test episode; with fewer than five episodes, the last one is."""
 
 
 def held_out(episode: np.ndarray) -> np.ndarray:
-    """(N,) bool: which rows are for testing, of (N,) episodes of rows; raises UserError for one episode alone."""
+    """Test rows (N,) bool, given each row's episode (N,); UserError if there is only one episode."""
     episode = np.unique(episode, return_inverse=True)[1]
     if episode.max() == 0:
         raise UserError("a probe fits some episodes and is tested on others: one alone is too few")
@@ -24,29 +24,28 @@ def held_out(episode: np.ndarray) -> np.ndarray:
 
 
 def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) -> float:
-    """Mean absolute error of a ridge regression, in percent of each target's standard deviation.
+    """Mean absolute error of a ridge regression on held-out episodes, in percent of each target's standard deviation.
 
-    0 is perfect. Knowing nothing, which predicts the mean, gives the targets' mean absolute deviation over their
-    standard deviation: 80 for normally distributed ones, less for heavier tails, never more than 100 on the data of
-    the fit.
+    0 is perfect. Uninformative features, for which the best prediction is the mean, give 80 for normally distributed
+    targets, less for heavier tails, and at most 100 on the training episodes.
 
     Args:
         features: (N, D) representations.
-        targets: (N, P) state variables; constant ones are left out (all constant: the error is 0).
-        episode: (N,) episode of every row, two at least; every fifth is held out, of fewer the last, others are fitted.
+        targets: (N, P) state variables; constant ones are left out (if all are constant, the error is 0).
+        episode: (N,) episode of every row, at least two; `held_out` picks the test episodes.
 
     Raises:
-        UserError: one episode alone.
+        UserError: there is only one episode.
     """
     error = _errors(features, targets, held_out(episode))
     return float(np.abs(error).mean() * 100) if error.size else 0.0
 
 
 def probe_r2(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) -> list[float]:
-    """Share of the targets' variance that a ridge regression explains in every held-out episode.
+    """Variance explained by a ridge regression, one value per held-out episode. Arguments and errors as `probe_error`.
 
-    One less the mean squared error in units of each target's variance on the data of the fit: 1 is perfect, 0 knows
-    nothing. The mean over episodes of one length is R^2, averaged over targets. Arguments and errors as `probe_error`.
+    Each is 1 - MSE / variance, with the variance of the training episodes, averaged over targets: 1 is perfect, 0 is
+    no better than the mean. If all episodes have the same length, the mean over episodes is R^2.
     """
     test = held_out(episode)
     errors = np.square(_errors(features, targets, test)).mean(1)
@@ -54,8 +53,8 @@ def probe_r2(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) -> 
 
 
 def _errors(features: np.ndarray, targets: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """Errors on the (N,) rows `test`, of the targets that vary, in their standard deviations; fitted on the others."""
-    from sklearn.linear_model import Ridge  # 110 MB that a training, which asks `held_out` alone, does not pay
+    """Standardised errors (rows, targets) on the rows `test`; fitted on the others, without constant targets."""
+    from sklearn.linear_model import Ridge  # 110 MB that training, which only needs `held_out`, does not load
     from sklearn.preprocessing import StandardScaler
 
     scale = StandardScaler().fit(targets[~test])
@@ -69,13 +68,13 @@ def _errors(features: np.ndarray, targets: np.ndarray, test: np.ndarray) -> np.n
 
 
 def probe_state(features: np.ndarray, physics: np.ndarray, episode: np.ndarray, layout: Layout) -> dict[str, float]:
-    """Errors of `probe_error` on pose (without the place on the ground) and velocity.
+    """`probe_error` for pose (without global position) and for velocity.
 
     Args:
         features: (N, D) representations.
         physics: (N, P) simulator states.
         episode: (N,) episode of every row.
-        layout: tells pose from velocity.
+        layout: splits states into pose and velocity.
     """
     return {
         "probe_pose": probe_error(features, layout.pose(physics), episode),

@@ -1,12 +1,12 @@
-"""Visibility proofs: what an inverse model's predictions depend on, against what it declares.
+"""Visibility checks: compare what an inverse model's predictions depend on with what it declares in `visible`.
 
-A prediction that sees the action it is asked for, or less than it claims, gives numbers that mean something else than
-its name. Two proofs show both, in float64 on small windows: gradients of every logit with respect to every observation
-and action, and the logits that differ when one of these takes another value. The second also finds what gradients do
-not pass: detached copies, rounded and compared values.
+If a prediction sees its target action, or less than the method claims, the results are not that method's. Two checks
+in float64 on small windows find this: the gradient of every logit with respect to every observation and action, and
+whether the logits change when one of these inputs changes. The second also finds dependence without gradient: detached
+copies, rounded or compared values.
 
-An observation is a stack of frames, so rows that are not seen can show in the stacks of rows that are: each proof can
-also be asked for single frames, through the stacking.
+An observation is a stack of frames, so a hidden row's frame can appear in a visible row's stack. With `frames=True`,
+both checks therefore work on single frames instead of rows.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from vd4rl_pomdp.core.types import Windows, previous
 from vd4rl_pomdp.nn.objective import InverseObjective
 
 Seen = tuple[set[int], set[int]]
-"""Observation rows j (of o_j), or single frames j (the newest of o_j), and action indices j (of a_j)."""
+"""(observations, actions): indices j of o_j, or of single frames (frame j is the newest of o_j), and of a_j."""
 Pair = tuple[int, int, int]
 """(window, t, k)."""
 
 
 def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int = 6, frames: bool = False) -> list[Pair]:
-    """Pairs whose prediction depends on other rows or actions than `objective.visible` declares.
+    """Find pairs whose prediction depends on other inputs than `objective.visible` declares.
 
-    A pair holds if the prediction has a gradient to all that is declared, changes with all of it, and neither has a
-    gradient to anything else nor changes with it.
+    A pair passes if the inputs with a nonzero gradient, the inputs that change the prediction, and the declared inputs
+    are the same sets.
 
     Args:
-        objective: a small one (few features, few units, but some 30 in the head: of very few, all may be rectified to
-            zero at a pair); the proof takes a backward pass for every pair. It is changed to float64.
-        lengths: real rows of each window of the batch; the first ends inside its episode, the others at an end.
-        rows: rows T of the windows, padding included.
-        frames: compare single frames with `objective.visible_frames`, in place of rows.
+        objective: a small one, since each pair takes a backward pass; but some 30 units in the head, or its ReLUs may
+            all be zero for a pair. It is converted to float64 in place.
+        lengths: real rows of each window of the batch. The first window ends inside its episode, the others at its end.
+        rows: rows T of each window, padding included.
+        frames: check single frames against `objective.visible_frames` instead of rows.
 
     Returns:
-        (window, t, k) of every pair that is wrong; empty if all hold.
+        (window, t, k) of every pair that fails; empty if all pass.
 
     Raises:
-        ValueError: a window's predictions depend on another window of the batch, or differ from call to call.
+        ValueError: a prediction depends on another window of the batch, or differs from call to call.
     """
     felt = response(objective, lengths, rows, frames)
     return [
@@ -54,7 +54,7 @@ def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int =
 
 
 def declared(objective: InverseObjective, t: int, k: int, length: int, last_action: bool, frames: bool = False) -> Seen:
-    """What `objective` declares visible; `last_action` tells whether the window's last row has an action."""
+    """Inputs that `objective` declares visible for (t, k); `last_action`: the window's last row has an action."""
     rows, actions = objective.visible(t, k, length)
     seen = objective.visible_frames(t, k, length) if frames else rows
     return seen, {a for a in actions if a < length - 1 or last_action}
@@ -63,7 +63,7 @@ def declared(objective: InverseObjective, t: int, k: int, length: int, last_acti
 def dependence(
     objective: InverseObjective, lengths: Sequence[int], rows: int = 6, frames: bool = False
 ) -> dict[Pair, Seen]:
-    """(window, t, k) -> what the prediction has a gradient to, for all real pairs; see `wrong_pairs`."""
+    """(window, t, k) -> inputs with a nonzero gradient, for all real pairs; arguments as `wrong_pairs`."""
     objective = objective.double()
     inputs = obs, actions = [x.requires_grad_() for x in _inputs(objective, lengths, rows, frames, seed=0)]
     logits = _logits(objective, _window(obs, actions, lengths))
@@ -81,7 +81,7 @@ def dependence(
 def response(
     objective: InverseObjective, lengths: Sequence[int], rows: int = 6, frames: bool = False
 ) -> dict[Pair, Seen]:
-    """(window, t, k) -> what the prediction changes with, for all real pairs; see `wrong_pairs`."""
+    """(window, t, k) -> inputs whose change alters the prediction, for all real pairs; arguments as `wrong_pairs`."""
     objective = objective.double()
     (obs, actions), (new_obs, new_actions) = (_inputs(objective, lengths, rows, frames, seed) for seed in (0, 2))
     plain = _logits(objective, _window(obs, actions, lengths))
@@ -118,7 +118,7 @@ def _logits(objective: InverseObjective, window: Windows) -> Tensor:
 
 
 def _real_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int) -> Iterator[tuple[int, Pair]]:
-    """Place among the logits and (window, t, k) of every pair that lies within its window's real rows."""
+    """Yield (index among the pairs, (window, t, k)) for every pair within its window's real rows."""
     for p, (t, k) in enumerate(objective.pairs(rows).tolist()):
         yield from ((p, (b, t, k)) for b, length in enumerate(lengths) if t + k < length)
 
@@ -133,16 +133,16 @@ def _rows_with_gradient(grad: Tensor | None, window: int) -> set[int]:
 
 
 def _exchange(values: Tensor, others: Tensor, axis: int, place: int) -> Tensor:
-    """Copy of `values` whose slice at one place of an axis is that of `others`."""
+    """Copy of `values` with the slice at `place` along `axis` taken from `others`."""
     return values.index_copy(axis, torch.tensor([place]), others.narrow(axis, place, 1))
 
 
 def _inputs(
     objective: InverseObjective, lengths: Sequence[int], rows: int, frames: bool, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Random observations and actions a_0..a_{T-1} (B, T, A), padding included, float64.
+    """Random float64 observations and actions (B, T, A), padding included.
 
-    Observations are (B, T, C, H, W), or (B, S-1+T, C/S, H, W) single frames, those before the window first.
+    Observations are (B, T, C, H, W), or with `frames` (B, S-1+T, C/S, H, W) for stacks of S, oldest frame first.
     """
     shape = objective.encoder.config
     stack = objective.encoder.frame_stack if frames else 1
@@ -153,7 +153,7 @@ def _inputs(
 
 
 def _window(obs: Tensor, actions: Tensor, lengths: Sequence[int]) -> Windows:
-    """Windows of `_inputs`; the first ends inside its episode, the others at an end."""
+    """Windows from `_inputs`; the first ends inside its episode, the others at its end."""
     rows, length = actions.shape[1], torch.tensor(lengths)
     obs = torch.cat([obs[:, first : first + rows] for first in range(obs.shape[1] - rows + 1)], dim=2)
     has_action = torch.arange(rows) < length[:, None] - 1

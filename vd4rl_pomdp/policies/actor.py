@@ -1,9 +1,9 @@
-"""State-based SAC actors as small files: safetensors weights, numpy inference, no learning library needed.
+"""State-based SAC actors as small safetensors files with numpy inference; no deep learning library needed.
 
-An actor maps dm_control's flattened observations to a squashed Gaussian over actions (Haarnoja et al. 2018,
-arXiv 1801.01290): hidden layers of rectified units, or SimBa's residual blocks (Lee et al. 2024, arXiv 2410.09754),
-then a mean and a log standard deviation, tanh at the end. Observations may be standardised first. Weights are float32;
-an action is computed in double precision and rounded to float32 once, so that it does not depend on the processor.
+An actor maps dm_control's flattened observations to a tanh-squashed Gaussian over actions (Haarnoja et al. 2018,
+arXiv 1801.01290), by a ReLU MLP or SimBa's residual blocks (Lee et al. 2024, arXiv 2410.09754), optionally after
+standardising the observations. Weights are float32; actions are computed in float64 and rounded to float32 once, so
+that they do not depend on the processor.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vd4rl_pomdp.runs.files import write_bytes
 
 LOG_STD_RANGE = (-20.0, 2.0)
 OBSERVATION_CLIP = 10.0
-"""Standardised observations are cut off here."""
+"""Standardised observations are clipped to +-10."""
 LAYER_NORM_EPSILON = 1e-6
 ASSETS = Path(__file__).parent / "assets"
 _REMEDY = "take another copy"
@@ -38,20 +38,20 @@ class Actor:
     """A stochastic policy on simulator states."""
 
     weights: dict[str, np.ndarray]
-    """float32: matrices (in, out) with their `.bias`: `mean.weight`, `log_std.weight`, and either `hidden.{i}.weight`
-    or `embed.weight`, `block.{i}.up.weight`, `block.{i}.down.weight`, with the layer norms `block.{i}.norm.scale` and
-    `norm.scale`; optionally `observation.mean` and `observation.std` (D,)."""
+    """float32 matrices (in, out), each with a `.bias`: `mean.weight`, `log_std.weight`, and either `hidden.{i}.weight`
+    (MLP) or `embed.weight`, `block.{i}.up.weight` and `block.{i}.down.weight` with layer norms `block.{i}.norm.scale`
+    and `norm.scale` (SimBa); optionally `observation.mean` and `observation.std` (D,)."""
     card: dict[str, Any]
-    """Where the actor comes from: task, quality, training step, mean return of 20 episodes, config, versions."""
+    """How it was trained: task, quality, training step, mean return of 20 episodes, config, versions."""
     sha256: str = ""
-    """Hash of the file the actor was read from."""
+    """Hash of the file that it was read from."""
 
     def act(self, state: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """Action for one state.
 
         Args:
-            state: (D,) float32, dm_control's observations flattened in order.
-            rng: source of the Gaussian sample; None gives the mean action.
+            state: (D,) float32, dm_control's observations, flattened in order.
+            rng: generator for sampling the action; None: the mean action.
 
         Returns:
             (A,) float32 in [-1, 1].
@@ -69,11 +69,11 @@ class Actor:
 
     @cached_property
     def _double(self) -> dict[str, np.ndarray]:
-        """The weights in double precision."""
+        """The weights in float64."""
         return {name: value.astype(np.float64) for name, value in self.weights.items()}
 
     def _features(self, x: np.ndarray) -> np.ndarray:
-        """Inputs of the two last layers, for the mean and for the standard deviation."""
+        """Output of the hidden layers, from which mean and log standard deviation are computed."""
         if "embed.weight" not in self.weights:
             for layer in range(self._count("hidden.{}.weight")):
                 x = np.maximum(self._linear(f"hidden.{layer}", x), 0.0)
@@ -99,49 +99,49 @@ class Actor:
         return x @ self._double[f"{name}.weight"] + self._double[f"{name}.bias"]
 
     def save(self, path: Path) -> None:
-        """Write the actor to one safetensors file, its card as JSON in the header."""
+        """Write the actor to a safetensors file, with its card as JSON in the header."""
         _save(self.weights, self.card, path)
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """Actors saved along one training run, standing for its replay buffer."""
+    """Checkpoints of an actor along one training run; playing them in turn imitates the run's replay buffer."""
 
     weights: dict[str, np.ndarray]
-    """As an actor's, float16, the rungs along a new first axis."""
+    """As `Actor.weights`, but float16 and stacked along a new first axis, one entry per checkpoint ("rung")."""
     card: dict[str, Any]
-    """Task, `decisions` of each rung, and its return on the learning curve, `curve`."""
+    """Task, `decisions` at each rung, and the return at each, `curve`."""
     sha256: str = ""
-    """Hash of the file the ladder was read from."""
+    """Hash of the file that it was read from."""
 
     @classmethod
     def of(cls, actors: list[Actor], card: dict[str, Any]) -> Ladder:
-        """Stack actors of one architecture; their weights are rounded to half precision."""
+        """Stack actors of the same architecture; their weights are rounded to float16."""
         names = actors[0].weights
         return cls({name: np.stack([a.weights[name] for a in actors]).astype(np.float16) for name in names}, card)
 
     @cached_property
     def rungs(self) -> list[Actor]:
-        """The actors, first to last."""
+        """The actors, in order of training."""
         count = len(self.card["decisions"])
         stacked = {name: value.astype(np.float32) for name, value in self.weights.items()}
         return [Actor({name: value[i] for name, value in stacked.items()}, self.card) for i in range(count)]
 
     def actor_at(self, progress: float) -> Actor | None:
-        """The actor at a moment of the training run, which ends at the last rung.
+        """The actor at a point of the training run.
 
         Args:
-            progress: moment as a share of the run, in [0, 1].
+            progress: fraction of the run, in [0, 1]; 1 is the last rung.
 
         Returns:
-            The rung nearest in decisions, None for uniformly random actions when the untrained start is nearer.
+            The nearest rung in decisions; None if step 0 is nearer, which stands for uniformly random actions.
         """
         steps = np.array([0, *self.card["decisions"]])
         nearest = int(np.abs(steps - progress * steps[-1]).argmin())
         return self.rungs[nearest - 1] if nearest else None
 
     def save(self, path: Path) -> None:
-        """Write the ladder to one safetensors file, its card as JSON in the header."""
+        """Write the ladder to a safetensors file, with its card as JSON in the header."""
         _save(self.weights, self.card, path)
 
 
@@ -153,9 +153,9 @@ def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> N
 
 
 def read_actor(path: Path, task: str | None = None) -> Actor:
-    """Read an actor file; raises UserError if it is missing, damaged, or made for another task than that called `task`.
+    """Read an actor file; UserError if it is missing, damaged, or made for another task than `task`.
 
-    Its weights must be finite and give an action for a state of the task.
+    Its weights must be finite and produce an action of the right size for the task's states.
     """
     actor = Actor(*_read(path, task))
     _check_weights(path, actor, task)
@@ -163,7 +163,7 @@ def read_actor(path: Path, task: str | None = None) -> Actor:
 
 
 def read_ladder(path: Path, task: str | None = None) -> Ladder:
-    """Read a ladder's file; raises UserError as `read_actor` does, for any of its actors."""
+    """Read a ladder file; errors as `read_actor`, for any of its actors."""
     ladder = Ladder(*_read(path, task))
     steps = ladder.card.get("decisions")
     if not isinstance(steps, list) or any(len(value) != len(steps) for value in ladder.weights.values()):
@@ -187,7 +187,7 @@ def _read(path: Path, task: str | None) -> tuple[dict[str, np.ndarray], dict[str
 
 
 def _check_weights(path: Path, actor: Actor, task: str | None) -> None:
-    """Raise UserError unless the weights are finite and give an action for a state of the task; mazes are no tasks."""
+    """Raise UserError unless the weights are finite and fit the task's states and actions; mazes are not checked."""
     name = task or actor.card.get("task", "")
     if name not in TASKS:
         return
@@ -202,24 +202,24 @@ def _check_weights(path: Path, actor: Actor, task: str | None) -> None:
 
 
 def load_actor(task: str, quality: str) -> Actor:
-    """Load the actor that ships for a task and a quality (`medium` or `expert`)."""
+    """Load the shipped actor of a task and a quality (`medium` or `expert`)."""
     return read_actor(_shipped(task, quality), task)
 
 
 def load_ladder(task: str) -> Ladder:
-    """Load the ladder of actors that ships for a task's medium_replay set."""
+    """Load the shipped ladder of actors that collects a task's medium_replay data set."""
     return read_ladder(_shipped(task, "replay"), task)
 
 
 def shipped_file(task: str, quality: str, sha256: str) -> Path | None:
-    """File of the actor that ships for a task and a quality, None if there is none or its content has another hash."""
+    """Path of the shipped actor of a task and quality; None if none ships or its SHA-256 is not `sha256`."""
     path = _asset(task, quality)
     same = path.exists() and hashlib.sha256(read_bytes(path)).hexdigest() == sha256
     return path if same else None
 
 
 def ships(task: str, quality: str) -> bool:
-    """Whether the actors of a set ship: random needs none, medium_expert needs two."""
+    """Whether all actors needed to collect a data set ship: random needs none, medium_expert needs two."""
     needed = {"random": (), "medium_replay": ("replay",), "medium_expert": ("medium", "expert")}
     quality = quality.removesuffix("_noisy")
     return all(_asset(task, name).exists() for name in needed.get(quality, (quality,)))

@@ -1,4 +1,4 @@
-"""A set's episodes as one HTML page that needs no network: frames, clean and corrupted, actions, rewards."""
+"""A dataset's episodes as one self-contained HTML page: frames, clean and corrupted, actions, rewards."""
 
 from __future__ import annotations
 
@@ -26,31 +26,32 @@ from vd4rl_pomdp.runs.files import Row, write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
 
 MOST_BYTES = 4_900_000
-"""Of a page: as many rows of each episode are shown as fit."""
+"""Maximum size of the page. As many rows per episode are shown as fit."""
 COLUMNS = 32
-"""Frames beside each other in a picture."""
+"""Frames per row of an image sheet."""
 _QUALITY = 50
 _POINTS = 600
-"""Points of a curve, at most."""
+"""Maximum points of a curve."""
 _LARGEST = 128
-"""Pixels of a shown frame's side, at most: of larger ones every second, third ... pixel is taken."""
+"""Maximum frame size in pixels; larger frames are subsampled by an integer step."""
 _MARK = b"<title>vd4rl-pomdp data view"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(StageConfig):
-    """Write a set's episodes as one HTML page, clean and corrupted; name --corruption before --help for its options."""
+    """Write a dataset's episodes as one HTML page, clean and corrupted. Put --corruption before --help to see its
+    options."""
 
     data: tyro.conf.Positional[Path] = Path()
     """Folder of shards."""
     out: Path = Path("view.html")
     """File to write."""
     episodes: int = 100
-    """Episodes to show, evenly spaced; the fewer, the more rows of each find room."""
+    """Episodes to show, evenly spaced. With fewer episodes, more rows of each fit."""
     seed: int = 0
     """Seed of the corruption."""
     corruption: CorruptionConfig = NO_CORRUPTION
-    """What is switched on and off; with `emission`, as runs of this seed see it."""
+    """The corruption to toggle; with `emission`, exactly as runs with this seed see it."""
 
     preset: tyro.conf.Suppress[str] = "paper"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
@@ -64,7 +65,7 @@ class ViewConfig(StageConfig):
         return {"corruption": CorruptionConfig.fill(values)}
 
     def check(self) -> None:
-        """Raise UserError for settings that cannot work, or another file in the page's place."""
+        """Raise UserError for invalid settings, or if `out` is another kind of file."""
         super().check()
         refuse_outside(self, episodes=(1, 500), seed=(0, MAX_SEED))
         refuse_inside(self.out)
@@ -74,10 +75,10 @@ class ViewConfig(StageConfig):
 
 
 def write_view(config: ViewConfig) -> Path:
-    """Write the page; returns its file.
+    """Write the page and return its path.
 
     Raises:
-        UserError: the set is damaged, the corruption does not fit its frames, or the file cannot be written.
+        UserError: the dataset is damaged, the corruption does not fit its frames, or the file cannot be written.
     """
     config.check()
     data = open_dataset(config.data)
@@ -86,7 +87,7 @@ def write_view(config: ViewConfig) -> Path:
     count = min(config.episodes, data.num_episodes)
     shown = np.linspace(0, data.num_episodes - 1, count).round().astype(int).tolist()
     longest = data.longest_episode
-    rows = min(longest, 16)  # a trial of few, to tell how many will fit
+    rows = min(longest, 16)  # trial page, to estimate how many rows fit
     few = shown[:: -(-count // 5)]
     trial = len(_page(config, view, few, rows)) / len(few) / rows
     rows = min(longest, max(2, int(MOST_BYTES / count / trial)))
@@ -99,7 +100,7 @@ def write_view(config: ViewConfig) -> Path:
 
 
 def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
-    """The page with so many rows of each of some episodes."""
+    """Render the page with `rows` rows of each shown episode."""
     data = view.dataset
     longest = data.longest_episode
     told = {
@@ -127,13 +128,13 @@ def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
 
 
 def _episode(view: View, number: int, rows: int, told: Row) -> Row:
-    """What the page's script reads of an episode."""
+    """An episode's data for the page's script."""
     data, place = view.dataset, view.dataset.rows_of(number)
     chosen = torch.from_numpy(np.unique(np.linspace(place.start, place.stop - 1, rows).astype(int)))
     stacks, keys = view.stacks(chosen), view.corruption.keys(data.keys(chosen))
     seen = view.corruption.corruption(stacks, keys)
     frames, index = data.stack_rows(chosen, FRAME_STACK).unique(return_inverse=True)
-    # What the corruption has changed lies over the clean picture, whose own pixels are lossy: these are exact.
+    # Changed pixels are overlaid losslessly on the clean image, which is lossy.
     before, after = (_pictures(x.reshape(-1, 3, *x.shape[-2:])) for x in (stacks, seen))
     changed = 255 * (before != after).any(-1, keepdims=True).astype(np.uint8)
     over = np.concatenate([np.where(changed, after, 0), changed], -1)
@@ -142,7 +143,7 @@ def _episode(view: View, number: int, rows: int, told: Row) -> Row:
         "return": round(float(data.returns[number]), 2),
         "rows": (chosen - place.start).tolist(),
         "length": place.stop - place.start,
-        "keys": list(map(str, keys.tolist())),  # more digits than JavaScript's numbers have
+        "keys": list(map(str, keys.tolist())),  # as strings: int64 exceeds JavaScript's numbers
         "frames": index.tolist(),
         "clean": _sheet(_pictures(data.frames[frames]), quality=_QUALITY),
         "over": _sheet(over, lossless=True) if changed.any() else "",
@@ -152,12 +153,12 @@ def _episode(view: View, number: int, rows: int, told: Row) -> Row:
 
 
 def _pictures(frames: torch.Tensor) -> np.ndarray:
-    """(N, 3, S, S) frames as (N, S', S', 3), every k-th pixel of large ones."""
+    """(N, 3, S, S) frames as (N, S', S', 3), subsampled if large."""
     return frames.numpy().transpose(0, 2, 3, 1)[:, :: (step := -(-frames.shape[-1] // _LARGEST)), ::step]
 
 
 def _sheet(pictures: np.ndarray, **options: Any) -> str:
-    """(N, S, S, C) pictures as one WebP, COLUMNS beside each other, in base64."""
+    """(N, S, S, C) pictures as one base64 WebP with COLUMNS per row."""
     count, size, _, channels = pictures.shape
     across, down = min(count, COLUMNS), -(-count // COLUMNS)
     filled = np.concatenate([pictures, np.zeros((across * down - count, *pictures.shape[1:]), np.uint8)])
@@ -168,6 +169,6 @@ def _sheet(pictures: np.ndarray, **options: Any) -> str:
 
 
 def _bytes(values: torch.Tensor, low: float, high: float) -> str:
-    """Numbers as 255ths of their range, a byte each, in base64."""
+    """Numbers quantised to one byte over their range, in base64."""
     scaled = (values - low) / (high - low or 1) * 255
     return base64.b64encode(scaled.round().byte().numpy().tobytes()).decode()

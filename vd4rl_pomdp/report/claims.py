@@ -1,14 +1,14 @@
-"""What the paper states of offline control, judged on returns, a setting at a time.
+"""The paper's claims about offline control, judged on returns in each setting.
 
-Its text and its two figures (Wu et al., arXiv 2404.14552, Section 4.2) say that baselines fail considerably under
-partial observability, that a history and then past actions improve on them, and that MIK+A is ahead in almost all
-tasks. Two distances stand beside that: to a memory that was told the states, and to the states themselves. Only runs of
-like settings are compared.
+The text and two figures of Wu et al. (arXiv 2404.14552, Section 4.2) claim that baselines fail considerably under
+partial observability, that a history and then past actions improve on them, and that MIK+A leads in almost all tasks.
+Two distances are reported besides: to a memory supervised with states, and to the states themselves. Only runs with
+equal settings are compared.
 
 Claims of a family (results/protocol.md names two) are tested together: Holm's method adjusts their p values over the
-family's claims that are measured in a setting. All others are exploratory and judged by themselves.
+family's claims measured in a setting. All others are exploratory and judged individually.
 
-`leads` holds MIK+A's lead against the budget of pretraining: does a larger one bring what a smaller one does not?
+`leads` measures MIK+A's lead over the pretraining budget: does it persist with a larger one?
 """
 
 from __future__ import annotations
@@ -42,34 +42,34 @@ from vd4rl_pomdp.runs.files import Row, groups
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
 NOT_REFUTED = "not refuted"
-"""What becomes of a claim that one side is not below the other, where that is undecided."""
+"""Verdict of an undecided "not below" claim."""
 DISTANCE = "distance"
-"""The kind of what is no claim."""
+"""Kind of a row that is a measurement, not a claim."""
 
 
 class Contender(NamedTuple):
-    """Runs that a claim is about."""
+    """The runs on one side of a claim."""
 
     method: str = ""
-    """A method; empty for every one that the other side does not name."""
+    """A method; empty: every method except the other side's."""
     history: str = "method"
     """Its `--history`."""
     clean: bool = False
-    """Whether they saw everything, whatever the setting hides."""
+    """Whether to take runs without corruption, whatever the setting hides."""
 
 
 class ReturnClaim(NamedTuple):
-    """The left side returns more than the right one."""
+    """A claim that the left side returns more than the right."""
 
     text: str
     left: Contender
     right: Contender
     hidden: bool = True
-    """Whether it is about settings that hide something, or about those that hide nothing."""
+    """True: for settings with a corruption; False: for settings without."""
     kind: str = "above"
-    """above; not below, which is refuted where the left side is below; distance, which is no claim."""
+    """above; not below (refuted if the left side is below); or distance, which is no claim."""
     family: str = EXPLORATORY
-    """The claims that it is tested with; exploratory: none."""
+    """Claims that it is tested together with; exploratory: none."""
 
 
 CLAIMS = (
@@ -106,18 +106,18 @@ CLAIMS = (
 
 
 def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
-    """One row for every claim and setting of which both sides have finished runs, with its `verdict`.
+    """One row with a `verdict` per claim and setting in which both sides have finished runs.
 
-    `difference` is the left side's mean return less the right one's, `low` and `high` its 95% interval, `p` its
-    two-sided p value; `clean_` are the same for the policies played with nothing hidden. A claim of a family is judged
-    by `adjusted_p`, an exploratory one by `p`. `smallest` is the difference that a test at 5% finds in 80% of cases
-    with this standard error, `smallest_share` the same as a share of the data's return. Where no runs of both sides
-    have like settings, there are none, and the verdict says what differs. Nothing is judged unless the critics of both
-    sides are known to have converged.
+    `difference` is the left side's mean return minus the right's, `low` and `high` its 95% interval, `p` its
+    two-sided p value; columns with `clean_` are the same without corruption. A claim of a family is judged by
+    `adjusted_p`, an exploratory one by `p`. `smallest` is the difference that a 5% test with this standard error
+    detects with 80% power; `smallest_share` is the same as a fraction of the data's return. If the sides have no
+    runs with equal settings, these are None and the verdict names the differences. Nothing is judged unless the
+    critics of both sides are known to have converged.
 
     Args:
         runs: of a report.
-        unranked: settings that are undecided: there nothing is judged.
+        unranked: undecided settings, in which nothing is judged.
     """
     finished = comparable(runs)
     settings = sorted({run.of(GATED) for run in finished})
@@ -130,7 +130,7 @@ def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) ->
 
 
 def tally(rows: list[Row]) -> str:
-    """What becomes of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
+    """Summary of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
     if rows[0]["kind"] == DISTANCE:
         return ""
     counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
@@ -143,7 +143,7 @@ def _place(row: Row) -> tuple[str, ...]:
 
 
 def _row(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tuple[Row, Sides] | None:
-    """A claim in a setting, not yet judged, and what it compares; None where a side has no run."""
+    """A claim in a setting, not judged yet, and its comparison; None if a side has no run."""
     corruption, alike = place[2], on_set(place, runs)
     if claim.hidden == (corruption == "none"):
         return None
@@ -168,29 +168,29 @@ def _row(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tuple[R
 
 
 def _decisive(left: list[Run], others: list[Run]) -> Sides:
-    """The comparison that decides a claim about every other method.
+    """The comparison that decides a claim about every other method, since it must hold against each of them.
 
-    Of those with other methods and variants it is the one that refutes it with the highest return, or else that leaves
-    it open, however few its seeds: the claim holds where it holds against every one.
+    Among other methods and variants: the one with the highest return of those that refute the claim, else of those
+    that leave it open, however few seeds they have.
     """
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
     alike = [pair for pair in pairs if not pair.unlike]
     refuted = [pair for pair in alike if _beyond(*difference(pair)[1]) == FAILS]
     doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS or not converged(pair.right)]
-    # Comparing with the best other method alone would pass over a lesser one that a single seed leaves open.
+    # The best other method alone is not enough: a weaker one with a single seed may leave the claim open.
     decisive = refuted or doubted or alike or pairs
     return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
 
 
 def _beyond(low: float | None, high: float | None) -> str:
-    """What the interval of a difference of means says of its left side being above."""
+    """Whether a difference's interval shows its left side above."""
     if low is None or high is None:
         return FEW
     return HOLDS if low > 0 else FAILS if high < 0 else OPEN
 
 
 def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[Run]) -> list[Run]:
-    """Runs of one side: of a method as it is, or of all other methods."""
+    """Runs of one side: of a method without variants, or of all other methods."""
     seen = seen_under("none" if side.clean else corruption, runs)
     if side.method:
         return as_it_is(side.method, seen, side.history)
@@ -220,18 +220,19 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
 
 LEADER, OTHER = "mik+a", "acro"
 OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}
-"""What stands against it, by the differences' names: the other method's `--history`."""
+"""What the leader is compared with, by the difference's name: the other method's `--history`."""
 
 
 def leads(runs: list[Run]) -> list[Row]:
-    """One row for every setting, policy's budget, difference and pretraining's budget.
+    """One row per setting, policy budget, difference and pretraining budget.
 
-    Only where these methods have at least two budgets of pretraining, and each a run. `difference` is the leader's mean
-    return less the other method's, every run's in % of the mean return of its own data; `low` and `high` are the ends
-    of its 95% interval over seeds and episodes. It is of runs of like settings; where there are none, it is None.
-    `left_seeds` and `right_seeds` count both sides' seeds, whether they can be compared or not.
+    Only where both methods have at least two pretraining budgets, with a run each. `difference` is the leader's
+    mean return minus the other method's, each run's in % of its own data's mean return; `low` and `high` bound its
+    95% interval over seeds and episodes. Only runs with equal settings are compared; without any it is None.
+    `left_seeds` and `right_seeds` count both sides' seeds, comparable or not.
 
-    A policy's budget are `updates` and `units` of a hidden layer, a pretraining's `steps` and `stacks` in a batch.
+    A policy's budget is its `updates` and hidden `units`; a pretraining's is its `steps` and frame `stacks` per
+    batch.
     """
     finished = [run for run in comparable(runs) if (run.reference.data_return or 0) > 0]
     sides_of = [as_it_is(LEADER, finished), *(as_it_is(OTHER, finished, history) for history in OTHERS.values())]

@@ -1,4 +1,4 @@
-"""Two result sets side by side: scores, differences, what only one of them has, and settings that are not the same."""
+"""Compares two sets of results: scores, differences, conditions in only one of them, and settings that differ."""
 
 from __future__ import annotations
 
@@ -23,28 +23,27 @@ from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.results import certificates_of
 
 FILE = "comparison"
-"""Its files' name, which tells a comparison's folder."""
+"""Base name of its files, by which a comparison's folder is recognised."""
 Conditions = dict[tuple, list[Run]]
 """Finished runs by the values of CONDITION."""
 
 
 class SideBySide(NamedTuple):
-    """Two result sets side by side."""
+    """Two sets of results side by side."""
 
     sides: list[Row]
-    """Of each its `path`, how many runs `finished`, how many `others` are not compared, and what they were `made` with:
-    commits and machines."""
+    """For each set its `path`, the number of runs that are `finished`, of `others` that are not compared, and the
+    commits and machines they were `made` with."""
     rows: list[Row]
-    """One a condition: scores with intervals and n of both, difference with interval, settings that differ, and what is
-    certified of memory."""
+    """One per condition: scores with intervals and n of both, difference with interval, differing settings, and what is
+    certified about memory."""
 
 
 def compare_results(one: Path, other: Path) -> SideBySide:
     """Compare the final scores of all finished runs at or below two paths, run folders or results folders.
 
-    Conditions are those of a report of each set. Those of equal settings are compared, whatever a report of their own
-    set calls them; then those of the same name; then a method that has a single variant in either set, whatever its
-    settings.
+    Conditions are those of a report of each set. They are matched by equal settings, whatever their names; then by
+    name; then, if a method has a single variant in each set, by method.
 
     Raises:
         UserError: a path holds no evaluated run, or a file is damaged.
@@ -69,13 +68,13 @@ def _loaded(path: Path) -> tuple[Row, Conditions]:
 
 
 def _partners(first: Conditions, second: Conditions) -> dict[tuple, tuple]:
-    """By condition of the first set, that of the second which it is compared with, if there is one."""
+    """Match conditions: first set's key -> second set's key, where there is a partner."""
     settings = {_what_was_done(runs): key for key, runs in second.items()}
     equal = {key: settings.get(_what_was_done(runs)) for key, runs in first.items()}
     found = {key: partner for key, partner in equal.items() if partner is not None}
     free = second.keys() - set(found.values())
     for key in first.keys() - found.keys():
-        # Of a method with a lone variant on either side, whatever its settings.
+        # A method with a single variant in each set, whatever its settings.
         alike, theirs = ([one for one in part if one[:-1] == key[:-1]] for part in (first, second))
         partner = key if key in second else theirs[0] if len(alike) == len(theirs) == 1 else None
         if partner in free:
@@ -84,13 +83,13 @@ def _partners(first: Conditions, second: Conditions) -> dict[tuple, tuple]:
 
 
 def _what_was_done(runs: list[Run]) -> tuple:
-    """What a condition's runs computed on what, as their files have it: not by names that depend on other runs."""
+    """What a condition's runs computed, from their files only, since names depend on the other runs of a set."""
     labels = (value for name, value in runs[0].result.labels.items() if name != "seed")
     return *labels, frozenset(frozenset(run.settings.items()) for run in runs)
 
 
 def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
-    """A condition's row; what a set does not have is None."""
+    """A condition's row; None for what a set lacks."""
     row: Row = dict(zip(CONDITION, key, strict=True))
     scores = [stats.by_episode([[episode["score"] for episode in run.last] for run in runs]) for runs in (one, other)]
     for side, mine in zip("ab", scores, strict=True):
@@ -100,14 +99,14 @@ def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
     if one and other:
         a, b = scores
         same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(a, b)
-        # The same runs are no two samples: an interval about 0 would tell how sure a difference is that is none.
+        # Identical runs are not two samples: no interval around a difference of 0.
         row["low"], row["high"] = (None if same else stats.difference_interval(b, a)) or (None, None)
         row |= {"difference": float(b.mean() - a.mean()), "settings": _differing(one, other)}
     return row
 
 
 def _differing(one: list[Run], other: list[Run]) -> str:
-    """Settings whose values are not the same in both sets: "steps 20 → 60, views 4 → 1"."""
+    """Settings whose values differ between both sets: "steps 20 → 60, views 4 → 1"."""
     told = []
     for name in dict.fromkeys(name for run in (*one, *other) for name in run.settings):
         mine, theirs = (sorted({run.settings.get(name, "unset") for run in runs}) for runs in (one, other))
@@ -130,7 +129,7 @@ _COLUMNS: Columns = {
 
 
 def print_comparison(comparison: SideBySide, console: Console | None = None) -> None:
-    """The comparison on the terminal, one table a setting; what differs stands under the method's label."""
+    """Print the comparison, one table per setting, with differing settings under the method's name."""
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side['others']} unfinished or diverged" if side["others"] else ""
@@ -150,7 +149,7 @@ def check_out(out: Path) -> None:
 
 
 def write_comparison(comparison: SideBySide, out: Path) -> Path:
-    """Write the comparison as page, CSV and LaTeX into a folder that `check_out` accepts; returns the page."""
+    """Write the comparison as page, CSV and LaTeX into a folder checked by `check_out`; returns the page."""
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     rows = pd.DataFrame(comparison.rows)

@@ -1,4 +1,4 @@
-"""A report's figures, one panel a task and quality, each of a table of `report.tables`: looks, names and files."""
+"""A report's figures: one panel per task and quality, drawn from the tables of `report.tables`."""
 
 from __future__ import annotations
 
@@ -23,54 +23,55 @@ from vd4rl_pomdp.report import stats, tables
 from vd4rl_pomdp.report.load import ACTION_ERRORS, COSTS, PROBES, REFERENCES, SETTING, Run, labels
 from vd4rl_pomdp.runs.files import replacing_file
 
-mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"  # ids in an SVG are random otherwise, and no two pages are alike
-mpl.rcParams["pdf.fonttype"] = 42  # TrueType: publishers refuse Type 3
+mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"  # else SVG ids are random, and no two pages are equal
+mpl.rcParams["pdf.fonttype"] = 42  # TrueType, as publishers reject Type 3
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
-"""Okabe and Ito's palette, which colour-blind readers can tell apart."""
+"""Okabe and Ito's palette for colour-blind readers."""
 DASHES, MARKERS, HATCHES = ("-", "--", ":", "-."), "osD^", ("", "////", "....", "xxxx")
-"""As many as there are rounds through the colours before looks repeat."""
+"""Dashes, markers and hatches of successive rounds through the colours, before styles repeat."""
 LOOKS = (
     *("mik+a", "mik", "acro", "ah+a", "fj+a", "supervised+a", "random", "ah", "fj", "supervised", "state"),
     *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc", "acdf", "smwm"),
     *("supervised_picture", "integrator"),
 )
-"""The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
+"""The package's methods in fixed style order, so that a method looks the same in every report. The first ones differ in
+colour."""
 DPI = 150
 FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": DPI}, "pdf": {"metadata": {"CreationDate": None}}}
-"""Files of a figure, beside the SVG in the page."""
+"""File formats of a figure, in addition to the SVG in the page."""
 WIDTH, HEIGHT = 10.0, 2.1
-"""Of a figure, and of a panel unless it says otherwise, in inches."""
+"""Width of a figure and default height of a panel, in inches."""
 Draw = Callable[[Axes, pd.DataFrame], None]
 QUALITIES = ("expert", "medium_expert", "medium")
-"""Those of the paper's figures, which come first."""
+"""Qualities in the paper's figures, which come first."""
 NAME_WIDTH = 28
-"""Characters of a method's name in a figure before it is wrapped."""
+"""Characters after which a method's name is wrapped."""
 MANY = 300
-"""Dots of a figure, above which they are one picture within it."""
+"""Number of dots above which a figure's dots are rasterised."""
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure with all that is told of it."""
+    """A figure and its description."""
 
     name: str
-    """Of its files."""
+    """Base name of its files."""
     caption: str
     words: str
-    """What it shows, for those who do not see it."""
+    """Alternative text for readers who cannot see it."""
     figure: Figure
     rows: pd.DataFrame
-    """What it shows, as its CSV file holds it."""
+    """Its data, as in its CSV file."""
 
 
 def looks_of(names: Iterable[str]) -> dict[str, int]:
-    """Numbers of looks by label: the package's methods have their own, others those that follow."""
+    """Style number by label: fixed for the package's methods, then others in order."""
     others = sorted(set(names) - set(LOOKS), key=lambda name: (name.partition(",")[0] in REFERENCES, name))
     return {name: number for number, name in enumerate([*LOOKS, *others])}
 
 
 def style(number: int) -> dict[str, Any]:
-    """Colour, dashes and marker of the method of this number."""
+    """Line and marker style of a number."""
     turn = number // len(COLOURS)
     return {
         "color": COLOURS[number % len(COLOURS)],
@@ -81,18 +82,18 @@ def style(number: int) -> dict[str, Any]:
 
 
 def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, heights: Sequence[float] = ()) -> Figure:
-    """A figure with a panel for each title, row by row, and below them the legend of what they name.
+    """A figure with one titled panel per entry, filled row by row, and a shared legend below.
 
     Args:
-        panels: title, rows and what draws them.
-        columns: panels in a row, at most.
+        panels: title, rows, and the function that draws them.
+        columns: maximum panels per row.
         heights: of each panel, in inches.
     """
     columns = min(columns, len(panels))
     sizes = list(heights) or [HEIGHT] * len(panels)
     height = [max(sizes[i : i + columns]) for i in range(0, len(panels), columns)]
     size = WIDTH if columns > 1 else 0.66 * WIDTH, sum(height) + 0.6 * len(height)
-    figure = Figure(figsize=size, dpi=DPI)  # laid out as saved: hinted text has another width at another resolution
+    figure = Figure(figsize=size, dpi=DPI)  # lay out at the saved resolution, as hinted text changes width with it
     figure.set_layout_engine("constrained")
     grid = figure.subplots(len(height), columns, squeeze=False, height_ratios=height)
     for axes, (title, rows, draw) in zip(grid.flat, panels, strict=False):
@@ -117,12 +118,12 @@ def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, he
             [entries[name] for name in names], names, loc="outside lower center", ncols=4, frameon=False, fontsize=8
         )
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # places are final: each of the files would find them again
+    figure.set_layout_engine("none")  # freeze the layout instead of recomputing it for each file
     return figure
 
 
 def seeds_note(counts: pd.Series, noun: str = "seed") -> str:
-    """n of what a figure or table shows, and a warning where it is small."""
+    """n of a figure or table, with a warning if it is small."""
     known = counts[counts > 0]
     if known.empty:
         return "No finished run."
@@ -133,7 +134,7 @@ def seeds_note(counts: pd.Series, noun: str = "seed") -> str:
 
 
 def file_name(*words: str) -> str:
-    """A name for files that says what is in them, whatever a corruption is called, and differs where the words do."""
+    """A readable file name from any words; a checksum keeps names with special characters distinct."""
     parts = []
     for word in filter(None, words):
         plain_word = re.sub(r"[^A-Za-z0-9+._-]+", "-", word).strip("-.")
@@ -142,7 +143,7 @@ def file_name(*words: str) -> str:
 
 
 def to_svg(figure: Figure) -> str:
-    """The figure as an <svg> element, the same bytes every time."""
+    """The figure as an <svg> element, byte-identical every time."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()
@@ -150,7 +151,7 @@ def to_svg(figure: Figure) -> str:
 
 
 def save_plot(folder: Path, plot: Plot) -> None:
-    """Write a figure's files into a folder that exists: what it shows as CSV, and itself in all FORMATS."""
+    """Write a figure's data as CSV and the figure in all FORMATS, into an existing folder."""
     write_table(folder / f"{plot.name}.csv", plot.rows.drop(columns="label", errors="ignore"))
     for kind, options in FORMATS.items():
         with replacing_file(folder / f"{plot.name}.{kind}") as fresh:
@@ -158,7 +159,7 @@ def save_plot(folder: Path, plot: Plot) -> None:
 
 
 def write_table(path: Path, table: pd.DataFrame) -> None:
-    """Write a table as CSV, so that a reader sees it whole or not at all; what is not known is empty."""
+    """Write a table as CSV, atomically. Unknown values are empty."""
     counts = ("step", "best_step", "seed", "seeds", "episodes", "runs")
     with replacing_file(path) as fresh:
         whole = table.astype({name: "Int64" for name in counts if name in table})
@@ -187,7 +188,7 @@ def draw_plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list
 
 
 def _figures(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[tuple[str, pd.DataFrame]]]]:
-    """By corruption: its rows, and the title and rows of each task and quality, the paper's qualities first."""
+    """By corruption: its rows, and title and rows of each task and quality, the paper's qualities first."""
     rank = rows["quality"].map({name: place for place, name in enumerate(QUALITIES)}).fillna(len(QUALITIES))
     for corruption, mine in rows.assign(_rank=rank, label=labels(rows)).groupby("corruption", sort=False):
         ordered = mine.sort_values(["_rank", "quality", "task"], kind="stable").drop(columns="_rank")
@@ -200,7 +201,7 @@ def _by_label(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _told(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 1) -> str:
-    """What a figure shows, in words: the last value of each method."""
+    """A figure's content in words: the last value of each method."""
     return "; ".join(
         f"{title}: "
         + ", ".join(f"{name} {mine[value].iloc[-1]:.{digits}f}" for name, mine in _by_label(rows[rows[value].notna()]))
@@ -211,13 +212,13 @@ def _told(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 
 def bar_plots(
     summary: pd.DataFrame, runs: pd.DataFrame, data: Mapping[tuple[str, str], float], looks: dict[str, int]
 ) -> list[Plot]:
-    """Final scores: one figure a corruption, a panel for each task and quality, a bar for each method.
+    """Final scores: one figure per corruption, one panel per task and quality, one bar per method.
 
     Args:
         summary: scores of every condition.
-        runs: table of runs, whose final scores are the dots.
-        data: the data's score by task and quality, which stands beside their names.
-        looks: numbers of all labels in `style`.
+        runs: table of runs; their final scores are drawn as dots.
+        data: the data's score by task and quality, shown in panel titles.
+        looks: style number of every label.
     """
     seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table), kind="seed")
     dots = seeds.groupby([*SETTING, "label"])["score"].agg(list).to_dict()
@@ -261,7 +262,7 @@ def bar_plots(
 
 
 def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str, **more: Any) -> None:
-    """A line for each label, with a band where the rows have one."""
+    """Draw a line per label, with a band if the rows have one."""
     for name, mine in _by_label(rows):
         look = style(looks[name]) | more
         draw, fill = (axes.step, {"step": more["where"]}) if "where" in more else (axes.plot, {})
@@ -273,7 +274,7 @@ def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str
 
 
 def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Score against updates, one figure a corruption, one line a method."""
+    """Score over updates: one figure per corruption, one line per method."""
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "step", "score")
@@ -286,7 +287,7 @@ def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
 
 
 def loss_plots(losses: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Action loss of pretraining against steps, one figure a corruption, one line a method."""
+    """Action loss over pretraining steps: one figure per corruption, one line per method."""
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "step", "action_loss", marker=None)
@@ -307,7 +308,7 @@ def _plots(
     shown: Callable[[pd.DataFrame], pd.DataFrame] = lambda rows: rows,
     height: Callable[[pd.DataFrame], float] = lambda rows: HEIGHT,
 ) -> list[Plot]:
-    """One figure a corruption, one panel a task and quality."""
+    """One figure per corruption, one panel per task and quality."""
     plots = []
     for corruption, rows, places in _figures(table):
         panels = [(title(place, members), members, draw) for place, members in places]
@@ -318,7 +319,7 @@ def _plots(
 
 
 def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Share of runs above a score, one panel a corruption, one line a method."""
+    """Fraction of runs above a score: one panel per corruption, one line per method."""
     if profiles.empty:
         return []
 
@@ -343,7 +344,7 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
 
 
 def lead_plots(leads: pd.DataFrame) -> list[Plot]:
-    """Differences against the budget of pretraining, one figure a corruption, a line for each difference."""
+    """Differences over the pretraining budget: one figure per corruption, one line per difference."""
     if leads.empty:
         return []
     looks = {name: number for number, name in enumerate(sorted(set(labels(leads))))}
@@ -384,12 +385,11 @@ DOTS = {
         "the mean squared difference of its actions from the data's actor's, on the data and in closed loop",
     ),
 }
-"""What returns are drawn against, by the names of the files: titles of two panels by the measures' columns, what the
-measures are in short, and at length."""
+"""Scatter plots of returns by file name: panel titles by measure, the axis label, and a longer description."""
 
 
 def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot]:
-    """Return against what probes read from representations, or how actions err: a dot a run, two panels a setting."""
+    """Return over probe errors or action errors: one dot per run, two panels per setting."""
     measures, axis, words = DOTS[name]
 
     def draw_against(column: str, many: bool) -> Draw:
@@ -422,7 +422,7 @@ def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot
 
 
 def cost_plots(costs: pd.DataFrame) -> list[Plot]:
-    """Mean minutes of pretraining and fine-tuning by method, one beside the other."""
+    """Mean minutes of pretraining and fine-tuning, as stacked bars by method."""
     rows = costs[costs[list(COSTS)].notna().any(axis=1)]
     if rows.empty:
         return []

@@ -1,4 +1,4 @@
-"""Pictures of evaluation episodes: a strip that can be printed, and a moving picture."""
+"""Renders films of evaluation episodes as still strips and as animations."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.files import Row
 
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
-"""Arrays of a film and their axes."""
+"""Arrays of a film and their number of dimensions."""
 
 STRIP_FRAMES = 8
-"""Frames in a film strip, at most."""
+"""Maximum frames in a film strip."""
 MOST_BYTES = 5 * 2**20
-"""Of all pictures in a page, as text; films beyond it are left out."""
+"""Maximum size of all films in a page, in base64; further films are left out."""
 Film = dict[str, np.ndarray]
 
 
 def read_film(path: Path) -> Film:
-    """Pictures of an evaluation episode; raises UserError for a damaged file."""
+    """Frames of an evaluation episode; UserError for a damaged file."""
     with damaged(path, "cannot be read", "remove it, and the report goes without"):
         with np.load(io.BytesIO(read_bytes(path))) as file:
             film = dict(file)
@@ -36,10 +36,10 @@ def read_film(path: Path) -> Film:
 
 
 def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:
-    """The film of the first seed of every method and setting, each read once, and how many found no room.
+    """The first seed's film for every method and setting, and the number of films that did not fit.
 
-    `title`; in base64 `strip`, a PNG, and `movie`, an animated WebP; `share` of the page's width that the strip takes;
-    `total`, the episode's return.
+    Keys: `title`; `strip` (PNG) and `movie` (animated WebP), both in base64; `share`, the strip's fraction of the
+        page width; `total`, the episode's return.
     """
     chosen: dict[tuple, Run] = {}
     for run in runs:
@@ -49,7 +49,7 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:
     for run in chosen.values():
         film = read_film(run.path / FILM_FILE)
         still, moving = (base64.b64encode(picture).decode() for picture in (strip(film), movie(film)))
-        size += len(still) + len(moving)  # all of it is in the page, which has to open from disk
+        size += len(still) + len(moving)  # everything is embedded, as the page must open from disk
         if size > MOST_BYTES:
             break
         made: Row = {"title": f"{title(run)}, seed {run.labels['seed']}", "strip": still, "movie": moving}
@@ -71,7 +71,7 @@ def strip(film: Film) -> bytes:
 
 
 def movie(film: Film) -> bytes:
-    """Animated WebP of an episode: clean at the left, the newest corrupted frame at the right."""
+    """Animated WebP of an episode: clean frame on the left, newest corrupted frame on the right."""
     newest = film["corrupted"][:, -3:]
     pairs = np.concatenate([film["clean"], newest], axis=3).transpose(0, 2, 3, 1)
     size = (pairs.shape[2] * 2, pairs.shape[1] * 2)
@@ -82,11 +82,11 @@ def movie(film: Film) -> bytes:
 
 
 def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
-    """Animated WebP of several agents in one episode, a row for each: the scene, then the stack that the agent sees.
+    """Animated WebP of several agents in one episode, one row each: the scene, then the stack that the agent sees.
 
     Args:
-        names: what to write above the rows.
-        films: one a row; stacks are shown oldest frame first, and an episode that ended early stands still.
+        names: titles of the rows.
+        films: one per row. Stacks are shown oldest frame first; an episode that ended early freezes.
     """
     frames = [
         np.concatenate(
@@ -101,7 +101,7 @@ def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
 
 
 def _row(name: str, film: Film, shot: int) -> np.ndarray:
-    """One agent at one moment, (H, W, 3) uint8."""
+    """One agent's row at one moment, (H, W, 3) uint8."""
     stack = film["corrupted"][shot]
     pictures = np.stack([film["clean"][shot], *stack.reshape(-1, 3, *stack.shape[1:])]).transpose(0, 2, 3, 1)
     large = pictures.repeat(2, axis=1).repeat(2, axis=2)

@@ -1,10 +1,12 @@
-"""Whether a setting can tell methods apart at all: what has to hold before its methods are ranked.
+"""Gates that a setting must pass before its methods are ranked.
 
-The data must suffice for the algorithm where the state is known (`state`) and where nothing is hidden (`acro` under
-`none`, as far as published methods get on pixels), under the corruption some method must be better than no training
-(`random`), and the critics of all these runs must have converged. Where one of these fails, differences between returns
-say more of the data, the algorithm and their budget than of the representations. The three are these methods as they
-are, without what variants add to them, and returns are compared between runs of like settings alone.
+1. The data must suffice for the algorithm, both with the state known (`state`) and with nothing hidden (`acro` under
+`none`, relative to published results from pixels).
+2. Under the corruption, some method must beat an untrained encoder (`random`).
+3. The critics of all these runs must have converged.
+
+If a gate fails, differences in return reflect the data, the algorithm and their budget more than the representations.
+The three reference methods are used without variants, and only runs with equal settings are compared.
 """
 
 from __future__ import annotations
@@ -35,45 +37,44 @@ from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words
 
 STATE_SHARE = 0.9
-"""Least share of the data's mean return, of `state`."""
+"""Minimum return of `state`, as a fraction of the data's mean return."""
 PUBLISHED_SHARE, ACRO_SHARE = 0.8, 0.7
-"""Least share, of `acro` under `none`: of what the better of BASELINES returns as published, but no more than of the
-data's mean return; and of the data's mean return on sets of whose quality no score is published."""
+"""Minimum return of `acro` under `none`: PUBLISHED_SHARE of the best published return of BASELINES, capped at the
+data's mean return; ACRO_SHARE of the data's mean return where no score is published for the dataset's quality."""
 BASELINES = {"bc": "BC", "drq_bc": "DrQ+BC"}
-"""V-D4RL's baselines of offline control from pixels, by their columns in `published_scores`."""
+"""V-D4RL's offline baselines from pixels, by column of `published_scores`."""
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
 NOT_RECORDED = "convergence is not recorded"
 GATED = (*SETTING, "algorithm")
 
 
 class Sides(NamedTuple):
-    """What is compared: seeds of two methods, each of one variant, or nothing where one has no run."""
+    """A comparison of two methods' seeds, each of one variant; empty if one side has no run."""
 
     left: list[Run]
     right: list[Run]
     unlike: list[str]
-    """Settings in which they differ; empty where the comparison is one of methods."""
+    """Settings in which both sides differ; if not empty, the comparison is not one of methods alone."""
 
 
 def gates(runs: list[Run]) -> list[Row]:
-    """One row for every task, quality, corruption and algorithm with frozen encoders' finished runs, and its `verdict`.
+    """One row with a `verdict` per task, quality, corruption and algorithm with finished runs of frozen encoders.
 
-    `data_return` is a mean over the sets behind its runs; `state_share`, `acro_share` and `best_share`, the best
-    method's, are shares of the return of their own, `state_seeds` and `acro_seeds` how many runs these rest on.
-    `acro_bar` is the least `acro_share`, `bar_from` the published score that it is made of. `above_random` is the best
-    method's mean return less that of `random`, as `sides` finds them, `low` and `high` its 95% interval. `converged`
-    tells whether the critics of all these runs did. What is not known is None.
+    `data_return` is a mean over the datasets of its runs. `state_share`, `acro_share` and `best_share` (of the best
+    method) are fractions of the data's return; `state_seeds` and `acro_seeds` count the runs behind them.
+    `acro_bar` is the minimum for `acro_share`, and `bar_from` the published score behind it. `above_random` is the
+    mean return of the best method minus that of `random`, chosen by `sides`; `low` and `high` bound its 95%
+    interval. `converged` says whether the critics of all these runs did. Unknown values are None.
     """
     finished = comparable(runs)
     return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
 
 
 def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple[str, ...], str]:
-    """What certificates say of memory in every setting with an evaluated run; where its runs are of several sets, of
-    each.
+    """By setting with an evaluated run, what certificates say about the need for memory, for each of its datasets.
 
     Args:
-        runs: those of a report.
+        runs: runs of a report.
         certificates: by id.
     """
     found = {}
@@ -85,18 +86,18 @@ def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple
 
 
 def comparable(runs: Iterable[Run]) -> list[Run]:
-    """Finished runs whose encoders were frozen: one that the policy trains says nothing of an objective."""
+    """Evaluated runs with frozen encoders. End-to-end training says nothing about a pretraining objective."""
     return [run for run in runs if run.evaluated and not run.end_to_end]
 
 
 def on_set(place: tuple[str, ...], runs: Iterable[Run]) -> list[Run]:
-    """Runs of a row's task, quality and algorithm, whatever was hidden from them."""
+    """Runs with a row's task, quality and algorithm, under any corruption."""
     task, quality, _, algorithm = place
     return [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
 
 
 def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
-    """The settings that are undecided: values of some columns, where all rows that have them miss a gate."""
+    """Undecided settings: values of some columns for which all rows fail a gate."""
     places = groups(table, lambda row: tuple(row[name] for name in names))
     return {place for place, rows in places.items() if all(row["verdict"].startswith(FAILED) for row in rows)}
 
@@ -149,39 +150,40 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
         unknown.append(NOT_RECORDED)
     if still := [name for name, mine in everyone.items() if converged(mine) is False]:
         missed.append(f"critics had not converged ({', '.join(still)})")
-    if missed:  # one is enough, whatever is not known of the others
+    if missed:  # one failed gate suffices, whatever is unknown about the others
         return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
     return row | {"verdict": f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED}
 
 
 def pixel_bar(task: str, quality: str, data: Sequence[float | None]) -> tuple[float | None, str]:
-    """Least share of its data's return that `acro` under `none` must return, and where that is from.
+    """Minimum return of `acro` under `none`, as a fraction of its data's return, and the published score behind it.
 
     Args:
-        task: of a set.
-        quality: of a set.
-        data: mean return of the data of each run that is judged; without any, or one above 0, there is no bar.
+        task: the dataset's task.
+        quality: the dataset's quality.
+        data: mean return of each judged run's data. Unless all are known and above 0, there is no minimum.
     """
     scores = [row for row in published_scores() if (row["env"], row["dataset"]) == (task, quality)]
     if not scores:
         return ACRO_SHARE, "none published"
     score, name = max((float(scores[0][column]), name) for column, name in BASELINES.items())
     returns = [value for value in data if value is not None and value > 0]
-    # Published behaviour returned less than ours on some sets: what counts on them is to keep up with our own data.
+    # Published returns exceed ours on some datasets: there, matching our own data's return is enough.
     shares = [min(1.0, 10 * score / value) for value in returns]
     known = bool(returns) and len(returns) == len(data)
     return PUBLISHED_SHARE * float(np.mean(shares)) if known else None, f"{name} {score:g}"
 
 
 def converged(runs: Iterable[Run]) -> bool | None:
-    """Whether the critics of all runs did: False if one did not, else None if it is not recorded of one."""
+    """Whether the critics of all runs converged: False if one did not, else None if one is not recorded."""
     told = {run.converged for run in runs}
     return False if False in told else None if None in told else True
 
 
 def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
-    """Runs under a corruption, and seeds of `state` of others where it has none: nothing is hidden from it."""
-    # The setting's own first: a seed of `state` that ran under two corruptions is one seed, not two.
+    """Runs under a corruption. Missing seeds of `state` are taken from other corruptions, since nothing is hidden from
+    it."""
+    # The setting's own runs first, so that a seed of `state` under two corruptions counts once.
     found: dict[tuple[str, ...], Run] = {}
     for run in sorted(runs, key=lambda run: run.labels["corruption"] != corruption):
         if run.labels["corruption"] == corruption or run.method == STATE:
@@ -190,24 +192,24 @@ def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
 
 
 def as_it_is(method: str, runs: Iterable[Run], history: str = "method") -> list[Run]:
-    """The runs of a method as it is: those that add nothing to it but a history. What is not recorded adds nothing."""
+    """Runs of a method without variants other than its history. Unrecorded settings count as plain."""
     plain = (PLAIN | {"history": history}).items()
     mine = [run for run in runs if run.method == method]
     return [run for run in mine if all(run.settings.get(name, PLAIN[name]) == value for name, value in plain)]
 
 
 def best_of(runs: Iterable[Run]) -> list[Run]:
-    """The seeds of the method and variant whose mean return is highest, none if there is no run.
+    """Seeds of the method and variant with the highest mean return; empty without runs.
 
-    One with a single seed is taken only where none has more.
+    A variant with a single seed is chosen only if none has more.
     """
     return max(seeds_by_variant(runs), key=_preference, default=[])
 
 
 def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
-    """Of the pairs of a method and variant of each side the one to be compared.
+    """The pair of variants to compare, one from each side.
 
-    First come pairs of like settings, then those with more than one seed on both sides, then those that return most.
+    Prefers pairs with equal settings, then with more than one seed on both sides, then with the highest returns.
     """
     others = seeds_by_variant(right)
     pairs = [Sides(one, other, _unlike(one, other)) for one in seeds_by_variant(left) for other in others]
@@ -216,22 +218,22 @@ def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
 
 
 def seeds_by_variant(runs: Iterable[Run]) -> list[list[Run]]:
-    """Seeds by method and variant; where they share an encoder, their spread is not that of a method."""
+    """Seeds by method and variant. Seeds that share an encoder are left out: their spread is not a method's."""
     own = (run for run in runs if ENCODER_SEED not in run.settings)
     return list(groups(own, lambda run: run.of(("method", "variant"))).values())
 
 
 def _preference(*compared: list[Run]) -> tuple[int, float]:
-    """How many have more than one seed, and the sum of their mean returns."""
-    # Otherwise a single lucky seed would be the best method, and no interval could say how lucky.
+    """Sort key: number of sides with more than one seed, then the sum of mean returns."""
+    # Otherwise a lucky single seed could win, without an interval to show it.
     return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
 
 
 def _unlike(left: list[Run], right: list[Run]) -> list[str]:
-    """Settings that seeds of both sides have, but not alike, other than what a claim is about and what hides pixels.
+    """Settings that differ between both sides, ignoring those under comparison and the corruption's.
 
-    Of a method that is not pretrained, only settings of fine-tuning count. Where every training seed has a set of its
-    own, that of both sides is the same.
+    For methods without pretraining, only fine-tuning settings count. If every training seed has its own dataset,
+    datasets count as equal.
     """
     one, other = left[0], right[0]
     names = (one.settings.keys() & other.settings.keys()) - PLAIN.keys() - of_corruption(one.settings).keys()
@@ -242,7 +244,7 @@ def _unlike(left: list[Run], right: list[Run]) -> list[str]:
     sets = {run.settings.get(DATA[0]) for run in (*left, *right)}
     if DATA[0] in names and len(sets) > 1 and not a_set_a_seed([*left, *right]):
         found.append(DATA[0])
-    return [name for name in found if name in PRESETS] or found  # a preset stands for what it decides
+    return [name for name in found if name in PRESETS] or found  # a preset stands for the settings that it determines
 
 
 def returns_of(runs: list[Run]) -> np.ndarray:
@@ -251,15 +253,16 @@ def returns_of(runs: list[Run]) -> np.ndarray:
 
 
 def episodes_of(runs: list[Run], clean: bool = False) -> np.ndarray:
-    """Returns of the episodes of each run's last evaluation, or of that with nothing hidden, (n, episodes)."""
+    """Returns of the episodes of each run's last evaluation, or with `clean` of that without corruption, (n,
+    episodes)."""
     return stats.by_episode([[row["return"] for row in (run.last_clean if clean else run.last)] for run in runs])
 
 
 def difference(compared: Sides, clean: bool = False) -> tuple[float | None, tuple[float | None, float | None]]:
-    """Mean return of the left side less that of the right one, and its 95% interval over seeds and episodes.
+    """Mean return of the left side minus that of the right, and its 95% interval over seeds and episodes.
 
-    None where a side has no run, or settings differ, or, with `clean`, where a policy was not played with nothing
-    hidden; no interval where `stats.difference_interval` has none.
+    None if a side has no run, if settings differ or, with `clean`, if a policy was not evaluated without
+    corruption. The interval is None if `stats.difference_interval` has none.
     """
     everyone = [*compared.left, *compared.right]
     if not compared.left or compared.unlike or (clean and not all(run.last_clean for run in everyone)):
@@ -269,7 +272,7 @@ def difference(compared: Sides, clean: bool = False) -> tuple[float | None, tupl
 
 
 def _share(runs: list[Run]) -> float | None:
-    """Mean share of its own data's return that a run returns; None if there is no run, or a data return not above 0."""
+    """Mean return as a fraction of each run's own data return; None without runs or if a data return is not above 0."""
     data = [run.reference.data_return for run in runs]
     known = [value for value in data if value is not None and value > 0]
     return float((returns_of(runs) / known).mean()) if runs and len(known) == len(runs) else None

@@ -1,11 +1,11 @@
-"""Runs as a report looks at them: one typed record each, from which the frame of runs and that of evaluations are made.
+"""Loads runs for reports: one typed record per run, from which the frames of runs and of evaluations are built.
 
-A number of a table goes this way: rows of `episodes.csv` (`runs.results`), a `Run`, `runs_frame` or
-`episodes_frame`, a group-by in `report.tables`.
+Path of a number into a table: rows of `episodes.csv` (`runs.results`), a `Run`, `runs_frame` or `episodes_frame`, a
+group-by in `report.tables`.
 
-Variants of a method are told by the settings that differ among its runs, in words that stand beside the method's name:
-runs are seeds of one experiment only if they agree in everything but seed, folders, device and logging. A fine-tuning
-run has its own config, its encoder's, and the data of both.
+Variants of a method are named by the settings that differ among its runs, e.g. "max_k 1" in "acro, max_k 1". Runs are
+seeds of one experiment only if they agree in everything except seed, folders, device and logging. A fine-tuning run's
+settings include those of its encoder, and the data of both stages.
 """
 
 from __future__ import annotations
@@ -32,43 +32,43 @@ from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import DAMAGED, Result, find_results
 
 SETTING = ("task", "quality", "corruption")
-"""Columns of what methods are compared in."""
+"""Columns of the setting in which methods are compared."""
 CONDITION = (*SETTING, "algorithm", "method", "variant")
-"""What all seeds of an experiment share: the columns that tell it from others."""
+"""Columns shared by all seeds of an experiment, which identify it."""
 IDENTITY = (*CONDITION, "seed")
-"""Columns that tell a run's rows from all others of a report: what its files name it by, and its variant."""
+"""Columns that identify a run within a report: the labels in its files, and its variant."""
 PROBES = ("probe_pose", "probe_velocity")
-"""Errors of linear probes of an encoder."""
+"""Errors of an encoder's linear probes."""
 CRITIC = {"critic_value": "value", "critic_moved": "moved", "data_value": "data"}
-"""What a run's critic came to (see `critic_of`): columns, and what critic.json calls them."""
+"""Convergence of a run's critic (see `critic_of`): column -> key in critic.json."""
 COSTS = ("pretrain_seconds", "finetune_seconds")
 ACTION_ERRORS = ("path_error", "action_error")
-"""Of a policy, on the data's rows and in closed loop."""
+"""Errors of a policy's actions on the data's rows and in closed loop."""
 CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
-"""Columns that tell of the last evaluation, also as `clean_` under no corruption, and what `summarise` calls them."""
+"""Columns about the last evaluation, repeated with the prefix `clean_` for no corruption -> key in `summarise`."""
 MISSING = "missing"
 STATE = "state"
-"""The method that sees the simulator's state, whatever a setting hides."""
+"""The privileged method, which sees the simulator state whatever the setting hides."""
 END_TO_END = ("bc", "drq_bc")
-"""References that bring their own algorithm."""
+"""Baselines that are trained end to end by their own algorithm."""
 TOLD_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
-"""Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
+"""Methods whose encoders are trained on simulator states, including those of the probes' held-out episodes."""
 REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, STATE)
-"""Methods that are references, floors and ceilings: last in a table."""
+"""Reference methods (lower and upper bounds), last in a table."""
 
 Settings = dict[str, str]
-"""Values as words, by the name that is shown beside them."""
+"""Values as text, by displayed name."""
 Parts = tuple[str, str]
-"""What differs among all runs of a method, and of the data among those of one setting."""
+"""What differs among all runs of a method, and how data differ among its runs in one setting."""
 
 _UNSET = "unset"
 PRESETS = ("preset", "pretraining preset")
 DATA = ("data", "pretraining data")
-"""Names of the sets' fingerprints."""
+"""Names of the datasets' fingerprints."""
 OF_CORRUPTION = "corruption "
-"""What the names of a corruption's settings begin with: other parts may have options of the same names."""
+"""Prefix for the settings of a corruption, since other plug-ins may have options of the same name."""
 ENCODER_SEED = "pretraining seed"
-"""The seed of a run's encoder, where the run's own is another: its seeds share what they were pretrained with."""
+"""Seed of a run's encoder if it differs from the run's own: such runs share an encoder across seeds."""
 
 
 def _words(value: Any) -> str:
@@ -84,23 +84,23 @@ PLAIN = {
     **{"pose_noise": "0", "velocity_noise": "0"},
     **{name: _words(value) for name, value in LATER.items()},
 }
-"""Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
+"""Values that do not appear in a method's name; runs with other values are variants."""
 
 
 class Choice:
-    """What a report is about: everything, unless a subclass says otherwise."""
+    """Which runs a report covers: all of them, unless a subclass narrows it."""
 
     def among(self, results: list[Result]) -> list[Result]:
-        """The chosen ones of the runs that were found, in their order."""
+        """The chosen ones of the runs found, in order."""
         return results
 
     def asks(self, row: Row) -> bool:
-        """Whether a run that is not there, told by its labels, is missed."""
+        """Whether a run with these labels is reported as missing if it does not exist."""
         return True
 
     @property
     def wanted(self) -> Sequence[Row]:
-        """Labels of the policies that are asked for, where it is told."""
+        """Labels of the policies that should exist, if known."""
         return ()
 
 
@@ -108,7 +108,7 @@ ALL = Choice()
 
 
 def without_options(row: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
-    """Some labels of a run or gap, without what tells a corruption's options apart."""
+    """Some labels of a run or gap, with the corruption's options cut off ("patch, patch_size 48" -> "patch")."""
     return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in names)
 
 
@@ -119,20 +119,20 @@ class Run:
     result: Result
     """Its files."""
     labels: Row
-    """Values of `options.LABELS`; the task is empty until the run has opened its data. The corruption is followed
-    by its options where other runs have others of the same name, "patch, patch_size 48": that is another setting."""
+    """Values of `options.LABELS`; the task is empty until the run has opened its data. If other runs use other options
+    of the same corruption, the options are appended ("patch, patch_size 48"), as that is a different setting."""
     settings: Settings
-    """All settings in which runs of its method may differ, in words."""
+    """All settings, as text, in which runs of its method may differ."""
     reference: Reference
-    """What its policy is held against."""
+    """What its policy is compared with: data and behaviour policy."""
     measures: dict[str, float | None]
-    """Of its encoder, critic and costs: action_loss, PROBES, CRITIC, COSTS; None where it is not known."""
+    """Encoder, critic and cost measures: action_loss, PROBES, CRITIC, COSTS; None if unknown."""
     parts: Parts = ("", "")
-    """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
+    """Settings that distinguish it from other runs of its method; see `Parts`."""
 
     @property
     def path(self) -> Path:
-        """Its folder, or the results folder that tells of it."""
+        """Its folder, or the results folder that lists it."""
         return self.result.path
 
     @property
@@ -142,12 +142,12 @@ class Run:
 
     @property
     def stage(self) -> str:
-        """What it does: "pretrain", "finetune" or "navigation"."""
+        """ "pretrain", "finetune" or "navigation"."""
         return self.record["stage"]
 
     @property
     def method(self) -> str:
-        """Its method, without its variant."""
+        """Its method, without the variant."""
         return self.labels["method"]
 
     @property
@@ -157,7 +157,7 @@ class Run:
 
     @property
     def variant(self) -> str:
-        """Its settings that differ from those of other runs of its method: "max_k 1"; empty if none does."""
+        """Settings that distinguish it from other runs of its method: "max_k 1"; empty if none do."""
         return ", ".join(filter(None, self.parts))
 
     @cached_property
@@ -176,12 +176,12 @@ class Run:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """Evaluation rows under the corruption of training."""
+        """Evaluation rows under the training corruption."""
         return [row for row in self.result.rows if row["evaluated_under"] == row["corruption"]]
 
     @cached_property
     def last(self) -> list[Row]:
-        """Rows of its last evaluation, under the corruption of training."""
+        """Rows of its last evaluation, under the training corruption."""
         end = max((row["step"] for row in self.rows), default=None)
         return [row for row in self.rows if row["step"] == end]
 
@@ -193,26 +193,26 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has come to its end, as one that diverged has not."""
+        """Whether the run has finished without diverging."""
         return self.result.finished and self.result.diverged is None
 
     @property
     def evaluated(self) -> bool:
-        """Whether it has come to its end, and its policy was evaluated: what is compared."""
+        """Whether it has finished and was evaluated, so that it can be compared."""
         return self.finished and bool(self.rows)
 
     @property
     def converged(self) -> bool | None:
-        """Whether its critic did, by `CONVERGED`; True for an algorithm without one, None if it is not recorded."""
+        """Whether its critic converged, by `CONVERGED`; True for an algorithm without critic, None if not recorded."""
         told = self.result.files.get("critic", {} if self.labels["algorithm"] == "bc" else None)
-        if told == {} and "gamma" not in self.record["config"]:  # what discounts returns has a critic
+        if told == {} and "gamma" not in self.record["config"]:  # algorithms with a discount have a critic
             return True
         moved = self.measures["critic_moved"]
         return None if moved is None else abs(moved) < CONVERGED
 
     @property
     def progress(self) -> str:
-        """How far it is: "finished", "diverged at update 20 of 40", or "unfinished at 20 of 40 updates"."""
+        """How far it got: "finished", "diverged at update 20 of 40" or "unfinished at 20 of 40 updates"."""
         if self.finished:
             return "finished"
         unit = "updates" if self.stage == "finetune" else "steps"
@@ -223,7 +223,7 @@ class Run:
 
 
 def label(row: Mapping[str, Any]) -> str:
-    """A method's name in tables and figures, with the algorithm where it is not TD3+BC, and its variant."""
+    """A method's name in tables and figures, with the algorithm unless it is TD3+BC, and the variant."""
     algorithm = "" if row["method"] in END_TO_END or row["algorithm"] == "td3_bc" else row["algorithm"]
     return ", ".join(filter(None, (row["method"], algorithm, row["variant"])))
 
@@ -234,7 +234,7 @@ def setting(row: Mapping[str, Any]) -> str:
 
 
 def title(run: Run) -> str:
-    """A run's stage, method and setting, all but its seed."""
+    """A run's stage, method and setting, without the seed."""
     return f"{run.stage} {label(run.named)}, {setting(run.labels)}"
 
 
@@ -244,7 +244,7 @@ def labels(table: pd.DataFrame) -> pd.Series:
 
 
 def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choice = ALL) -> list[Run]:
-    """The chosen runs at or below the paths, of run folders and results folders; `but` as in `find_results`.
+    """The chosen runs at or below some run folders and results folders; `but` as in `find_results`.
 
     Raises:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
@@ -259,7 +259,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
 
 
 def _load(result: Result) -> Run:
-    """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
+    """Build a run from its files; UserError for files that are valid JSON but not what a run writes."""
     with damaged(result.place, *DAMAGED):
         probe, stored = result.files.get("probe", {}), result.files.get("reference")
         critic = result.files.get("critic", {})
@@ -277,11 +277,11 @@ def _load(result: Result) -> Run:
 
 
 def _told_apart(runs: list[Run]) -> list[Run]:
-    """Runs with their `parts`, and with the options in which others of their corruption's name differ beside it."""
+    """Set each run's `parts`, and append to its corruption the options that differ among runs of that corruption."""
     sets, names = [run.set_name for run in runs], [run.labels["corruption"] for run in runs]
     stages = [(run.stage, run.labels["algorithm"]) for run in runs]
     methods = [(*stage, run.method) for stage, run in zip(stages, runs, strict=True)]
-    # All runs are alike in what hides pixels: a corruption has one name, whatever learns under it.
+    # Corruption options are compared across all methods: equal corruptions must get equal names everywhere.
     hiding = without_sets([of_corruption(run.settings) for run in runs], sets, [""] * len(runs))
     own = without_sets([without(run.settings, of_corruption(run.settings)) for run in runs], sets, stages)
     options = differences(
@@ -292,7 +292,7 @@ def _told_apart(runs: list[Run]) -> list[Run]:
         for name, told in zip(names, options, strict=True)
     ]
     of_methods = differences([without(one, DATA) for one in own], methods)
-    # Two sets always differ in their fingerprints; only two contents of one set make another experiment.
+    # Different datasets always differ in fingerprint; only different contents of the same dataset matter.
     data = [{name: one[name] for name in DATA if name in one} for one in own]
     places = list(zip(methods, sets, corruptions, strict=True))
     for alike in (places, list(zip(places, of_methods, strict=True))):
@@ -308,11 +308,11 @@ def _told_apart(runs: list[Run]) -> list[Run]:
 
 
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
-    """All settings behind a run, those of a corruption with OF_CORRUPTION before their names.
+    """All settings of a run as text, with the prefix OF_CORRUPTION for those of its corruption.
 
     Args:
         record: its config.json.
-        card: its encoder's card, empty for a pretraining run or where there is none.
+        card: its encoder's pretraining record; empty for a pretraining run or without an encoder.
     """
     own, hiding = settings_of(record["config"]), dict(card.get("corruption", {}))
     if record["stage"] == "pretrain":
@@ -331,24 +331,25 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
 
 
 def of_corruption(settings: Settings) -> Settings:
-    """Those of some settings that are a corruption's."""
+    """The settings that belong to a corruption."""
     return {name: value for name, value in settings.items() if name.startswith(OF_CORRUPTION)}
 
 
 def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Settings but those of some names."""
+    """Settings without some names."""
     return {name: value for name, value in settings.items() if name not in names}
 
 
 def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
-    """Settings but those that go by the set, such as a budget: runs on one set agree in them, and the sets differ.
+    """Drop settings that vary with the dataset only, e.g. a budget per task: equal within each dataset, different
+    across.
 
-    Args:
-        settings: of every run.
-        sets: task and quality of every run.
-        alike: what runs share that are looked at together.
+        Args:
+            settings: of every run.
+            sets: task and quality of every run.
+            alike: grouping key of every run; groups are treated separately.
     """
-    # A task's own budget is no ablation: as a variant it would make two methods of one, and gaps on every other task.
+    # A per-task budget is no ablation. As a variant it would split a method in two, with gaps on every other task.
     kept = [dict(one) for one in settings]
     for places in groups(range(len(settings)), alike.__getitem__).values():
         for name in {name for i in places for name in settings[i]} - {ENCODER_SEED, *DATA}:
@@ -361,7 +362,8 @@ def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Seque
 
 
 def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list[str]:
-    """What differs of each run's settings among those that are alike, in words; nothing where none are recorded."""
+    """For each run, in words, the settings that differ within its group `alike`; "" for runs without recorded
+    settings."""
     words = [""] * len(settings)
     for places in groups((i for i, own in enumerate(settings) if own), alike.__getitem__).values():
         for i, told in zip(places, _differences([settings[i] for i in places]), strict=True):
@@ -370,15 +372,15 @@ def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list
 
 
 def _differences(settings: Sequence[Settings]) -> list[str]:
-    """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
+    """Per run, in words, the settings that differ among some runs: "max_k 1, steps 20". Values in PLAIN are omitted.
 
-    ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder. A preset is
-    named in place of the settings that it decides.
+    ENCODER_SEED is always shown, since nothing else reveals that seeds share an encoder. A preset replaces the
+    settings that it determines.
     """
     names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
     columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in settings] for name in names}
     columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
-    # An option of a chosen part is not there without the part: naming the part says it all.
+    # Options of a plug-in exist only with it, so naming the plug-in suffices.
     everywhere = [name for name, column in columns.items() if _UNSET not in column]
     columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
     presets: list[str] = []
@@ -393,16 +395,17 @@ def _differences(settings: Sequence[Settings]) -> list[str]:
 
 
 def _decided(name: str, columns: Mapping[str, list[str]], by: Sequence[str]) -> bool:
-    """Whether a setting has the same value wherever others, of which it is none, have the same."""
+    """Whether a setting is a function of others: equal wherever all of them are equal."""
     deciding = list(zip(*(columns[other] for other in by), strict=True)) or [()] * len(columns[name])
     return name not in by and len(set(zip(deciding, columns[name], strict=True))) == len(set(deciding))
 
 
 def a_set_a_seed(runs: Sequence[Run]) -> bool:
-    """Whether each of two or more training seeds has a set of its own, collected alike but for the collection's seed.
+    """Whether there are several training seeds, each with its own dataset, collected alike except for the collection
+    seed.
 
-    Then sets vary as seeds do, and runs on them are seeds of one method. Two contents for one training seed, or of one
-    collection, make other experiments.
+        Then datasets vary like seeds, and these runs count as seeds of one method. If one training seed has two
+        contents, or one collection seed has, they are different experiments.
     """
     plans = [run.record.get("collection") or {} for run in runs]
     contents = [run.record.get("inputs", {}).get("data") for run in runs]
@@ -416,9 +419,9 @@ def a_set_a_seed(runs: Sequence[Run]) -> bool:
 
 
 def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
-    """One row for every evaluation episode: `id` and IDENTITY of its run, and the columns of `episodes.csv`.
+    """One row per evaluation episode: `id` and IDENTITY of its run, and the columns of `episodes.csv`.
 
-    `as_trained` tells those under the corruption of training.
+    `as_trained` marks episodes under the training corruption.
     """
     rows = [
         row | run.named | {"id": run.result.id, "as_trained": row["evaluated_under"] == row["corruption"]}
@@ -430,7 +433,7 @@ def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
 
 
 def runs_frame(runs: Iterable[Run]) -> pd.DataFrame:
-    """One row for every finished and evaluated run: encoder, scores, control, costs and provenance; None is unknown."""
+    """One row per finished and evaluated run: encoder, scores, control, costs and provenance; None if unknown."""
     table = pd.DataFrame([_run_row(run) for run in runs if run.evaluated], columns=[*IDENTITY, *_RUN])
     return table.astype({name: float for name in _RUN if name not in _WORDS})
 
@@ -458,10 +461,10 @@ def _run_row(run: Run) -> Row:
 
 
 def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
-    """One row for each run that is missing or unfinished: CONDITION, seed and `state`.
+    """One row per missing or unfinished run: CONDITION, seed and `state`.
 
-    Expected in a setting are all methods of the report with all their variants, each with every seed that any other
-    run has in that setting, and what the choice wants there.
+    In each setting, every method of the report is expected with all its variants, for every seed that any run has
+    in that setting; also whatever the choice asks for there.
     """
     grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
     rows = []
@@ -470,7 +473,7 @@ def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
         seeds = sorted({run.labels["seed"] for run in here})
         for method, mine in groups(grid, lambda run: run.of(("algorithm", "method"))).items():
             for variant in _expected(mine, place):
-                # A seed on the encoder of its own is one of the method, not of the variant that shares it.
+                # A variant with a shared encoder needs no run for the seed that trained the encoder.
                 own = {seed for seed in seeds if f"{ENCODER_SEED} {seed}" in variant.split(", ")}
                 for seed in (seed for seed in seeds if seed not in own):
                     run = there.get((*place, *method, variant, seed))
@@ -481,7 +484,7 @@ def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
     rows = [row for row in rows if choice.asks(row)]
     known = {without_options(row, LABELS) for row in (*(run.labels for run in grid), *rows)}
     settings = {without_options(run.labels, SETTING): run.labels["corruption"] for run in grid}
-    for row in choice.wanted:  # what was never begun, in settings of any run
+    for row in choice.wanted:  # never started, in settings that some run has
         if without_options(row, LABELS) not in known and without_options(row, SETTING) in settings:
             named = {name: row.get(name, "") for name in CONDITION}
             named["corruption"] = settings[without_options(row, SETTING)]
@@ -490,10 +493,10 @@ def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
 
 
 def _expected(mine: list[Run], setting: tuple[str, ...]) -> Iterator[str]:
-    """Variants of a method that are expected in a setting: those of all settings that share a variant with it.
+    """Variants of a method expected in a setting: all variants of any setting that shares one with it.
 
-    Where each setting has variants of its own, such as a budget for every task, nothing is missing; nor is `state`
-    where other pixels of the same set are hidden. Those by data are expected where they are found.
+    If every setting has its own variants, e.g. a budget per task, nothing is missing. Nor is `state` if it ran on
+    the same dataset under another corruption. Variants by data are expected only where they occur.
     """
     by_setting = groups(mine, lambda run: run.of(SETTING))
     here = by_setting.get(setting, [])

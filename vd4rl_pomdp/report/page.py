@@ -1,9 +1,9 @@
-"""Write a report: one HTML page that opens from disk, beside it what its tables and figures are made of.
+"""Writes a report: an HTML page that opens from disk, and the files behind its tables and figures.
 
-index.html                       the page, with all figures in it
-NAME.csv, NAME.tex               its tables: all numbers, and as they are shown
+index.html                       the page, with all figures embedded
+NAME.csv, NAME.tex               its tables: all numbers, and as displayed
 figures/NAME.{csv,png,pdf}       its figures
-runs.jsonl, episodes.csv         the raw rows that everything is made of, see `vd4rl_pomdp.runs.results`
+runs.jsonl, episodes.csv         the raw rows behind everything, see `vd4rl_pomdp.runs.results`
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_certificates, refuse_loss, write_results
 
 SEEDS = 12
-"""Seeds that are named one by one, at most."""
+"""Maximum seeds that are listed individually."""
 
 
 class Report(NamedTuple):
@@ -55,27 +55,27 @@ class Report(NamedTuple):
     summary: pd.DataFrame
     """Table of final scores."""
     gates: list[Row]
-    """What has to hold before methods are ranked, by setting."""
+    """Gates that must pass before methods are ranked, by setting."""
     claims: list[Row]
-    """The paper's claims and what becomes of them, by setting."""
+    """The paper's claims and their verdicts, by setting."""
     unlike: list[str]
-    """What stands side by side and was not made of the same, in sentences."""
+    """Warnings, as sentences, about results that were made with different data or code."""
 
 
 def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
-    """Write the report of the runs at or below `paths` that `choice` is about, all of them by default, into `out`.
+    """Write a report of the runs at or below `paths` into `out`; `choice` narrows them.
 
-    The folder is a results folder, too, so that the report can be made again from it alone. A study that
-    `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
+    The folder is also a results folder, so the report can be rebuilt from it alone. A study that `vd4rl-pomdp
+    theory` wrote at or below `paths` becomes a section of the page.
 
     Raises:
-        UserError: there is nothing to report, a file is damaged, `out` holds anything but results or an earlier
-            report, or it tells of finished runs that are not reported.
+        UserError: there is nothing to report, a file is damaged, or `out` holds something else or finished runs
+            that this report lacks.
     """
     refuse_foreign(out, "report", f"{MARK}.csv", RUNS)
     runs = load_runs(paths, out, choice)
     results = [run.result for run in runs]
-    refuse_loss(results, out)  # early: drawing takes most of the time
+    refuse_loss(results, out)  # check early: drawing takes most of the time
     if not any(run.rows for run in runs):
         mazes = all(run.stage == "navigation" for run in runs)
         told = "`vd4rl-pomdp navigation report` reports its mazes" if mazes else "`vd4rl-pomdp finetune` evaluates"
@@ -87,18 +87,18 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     mixed = unlike(runs)
     page = _page(runs, made, shown, plots, mixed, load_section(paths))
     with owned(out):
-        refuse_loss(results, out)  # of runs that were added while this was drawn
+        refuse_loss(results, out)  # again: runs may have been added meanwhile
         _write(out, made, shown, plots)
         write_results(out, results)
         keep_certificates(out, certificates)
-        write_text(out / "index.html", page)  # last: whoever sees it finds what it links to
+        write_text(out / "index.html", page)  # last, so that everything it links to exists
     return Report(out / "index.html", made[MARK], judged, claimed, mixed)
 
 
 def _tables(
     runs: list[Run], choice: Choice, memory: dict[tuple[str, ...], str]
 ) -> tuple[dict[str, pd.DataFrame], list[Row], list[Row]]:
-    """All tables of a report as its CSV files hold them, by name; and the rows of gates and claims."""
+    """All tables of a report by name, as in its CSV files; and the rows of gates and claims."""
     evaluated = tables.evaluations(load.episodes_frame(runs))
     finished = load.episodes_frame(run for run in runs if run.finished)
     final = tables.evaluations(finished)
@@ -169,7 +169,7 @@ def _page(
 
 
 def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], plots: dict[str, list[Plot]]) -> None:
-    """Every table as CSV and LaTeX, and every figure; those that an earlier report had and this has not are removed."""
+    """Write every table as CSV and LaTeX, and every figure. Removes those of an earlier report that no longer exist."""
     folder = out / "figures"
     with disk_errors(out):
         folder.mkdir(exist_ok=True)
@@ -193,7 +193,7 @@ def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], pl
 
 
 def unlike(runs: list[Run]) -> list[str]:
-    """What stands side by side and was not made of the same, in sentences: contents of a set, code of a part."""
+    """Sentences about compared runs that differ in a dataset's content or in a plug-in's code."""
     told: dict[str, dict[str, set[str]]] = {}
     played = [run for run in runs if run.stage == "finetune" and run.rows]
     own = {name for name, mine in groups(played, lambda run: run.set_name).items() if a_set_a_seed(mine)}
@@ -212,9 +212,9 @@ def unlike(runs: list[Run]) -> list[str]:
 
 
 def _code(run: Run) -> dict[str, str]:
-    """Package and file of each part that is not this project's: of a pretraining's, then of a policy's if it is other.
+    """Package and file of each third-party plug-in, as in the pretraining and then, if different, in the fine-tuning.
 
-    Of a method those of the pretraining, where they are recorded: nothing of it is used afterwards.
+    For a method, only the pretraining's version counts if recorded, since fine-tuning does not use it.
     """
     found: dict[str, list[str]] = {}
     for record in (run.result.origin, run.record):
@@ -242,14 +242,14 @@ def _facts(name: str, runs: list[Run]) -> dict[str, str]:
 
 
 def made_with(runs: list[Run]) -> str:
-    """The commits and machines of runs, in words."""
+    """Commits and machines of runs, in words."""
     commits = ", ".join(dict.fromkeys(run.result.commit or "unknown" for run in runs))
     machines = "; ".join(dict.fromkeys(run.result.machine or "not recorded" for run in runs))
     return f"commit {commits}; {machines}"
 
 
 def print_summary(report: Report, console: Console | None = None) -> None:
-    """The verdicts of the gates and claims, then the tables of final scores, one a setting."""
+    """Print the verdicts of gates and claims, then the tables of final scores, one per setting."""
     console = console or Console()
     lines = [f"{with_algorithm(row)}: {row['verdict']}" for row in report.gates]
     tallies = {claim: tally(rows) for claim, rows in groups(report.claims, claim_of).items()}

@@ -1,4 +1,4 @@
-"""Tables of texts on the page, in LaTeX and on the terminal, and the HTML templates, which share base.html."""
+"""Renders tables of text as HTML, LaTeX and on the terminal, and fills the HTML templates."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.runs.files import Row, write_bytes
 
 SENTENCE = 48
-"""Letters from which on a cell does not fit on a page of LaTeX beside others."""
+"""Characters above which a LaTeX column wraps."""
 SYMBOLS = {"→": r"$\rightarrow$", "†": r"\dag{}", "–": "--", "×": r"$\times$"}
 Columns = dict[str, str | tuple[str, int] | tuple[str, str, str, int] | Callable[[Row], str]]
-"""Titles of a shown table's columns, and what each shows of a row: a word, a number with so many digits, a number with
-the ends of its interval, or a text."""
+"""Columns of a displayed table by title. Each shows a row's text, a number with a given number of digits, a number with
+its interval, or the result of a function."""
 
 _TEMPLATES = jinja2.Environment(
     loader=jinja2.PackageLoader("vd4rl_pomdp.report", ""),
@@ -31,12 +31,12 @@ _TEMPLATES = jinja2.Environment(
 
 
 def render(template: str, **values: Any) -> str:
-    """The page that a template of this package makes of some values."""
+    """Fill one of this package's templates."""
     return _TEMPLATES.get_template(template).render(**values)
 
 
 def texts(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
-    """A table as a reader sees it, with the index of its rows."""
+    """A table's displayed texts, with the index of its rows."""
     shown = [{title: _text(row, what) for title, what in columns.items()} for row in rows.to_dict("records")]
     return pd.DataFrame(shown, rows.index, columns=list(columns))
 
@@ -52,23 +52,23 @@ def _text(row: Row, what: Any) -> str:
 
 
 class Block(NamedTuple):
-    """A table as the page shows it."""
+    """A table as displayed on the page."""
 
     title: str
     html: str
     rows: int
     note: str
-    """n of what it shows."""
+    """Its sample size n."""
 
 
 def block(title: str, table: pd.DataFrame, words: int, note: str = "") -> Block:
-    """A table for the page; the first `words` columns hold words, the others numbers."""
+    """A table for the page. The first `words` columns are left-aligned text, the others numbers."""
     with pd.option_context("display.max_colwidth", None):
         return Block(title, table.to_html(index=False, border=0, classes=f"words{words}"), len(table), note)
 
 
 def write_latex(path: Path, table: pd.DataFrame, words: int, note: str = "") -> None:
-    """Write a table of texts in LaTeX, which needs booktabs and longtable; what UTF-8 cannot hold is spelt out."""
+    """Write a table of text as LaTeX (needs booktabs and longtable). Unencodable characters become escapes."""
     wide = [max(map(len, table[name]), default=0) > SENTENCE for name in table.columns[:words]]
     form = "".join(r"p{0.3\linewidth}" if sentences else "l" for sentences in wide)
     form += "r" * (len(table.columns) - words)
@@ -80,7 +80,7 @@ def write_latex(path: Path, table: pd.DataFrame, words: int, note: str = "") -> 
 
 
 def terminal(title: str, table: pd.DataFrame) -> Table:
-    """A table of texts for the terminal; the first column and that of gaps are folded, numbers are not."""
+    """A table of text for the terminal. The first column and the gaps wrap; numbers do not."""
     shown = Table(title=Text(title), title_justify="left")
     for name in table.columns:
         words = name in (table.columns[0], "not there")

@@ -1,4 +1,4 @@
-"""The tables that a report's page shows: their columns, in words, and how they are cut."""
+"""Tables shown on a report's page: their columns, and how they are split."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.runs.files import Row
 
 MARK = "summary"
-"""The table that is always there: its file tells a report's folder."""
+"""The table that every report has; its file identifies a report's folder."""
 WIDEST = 6
-"""Methods side by side in a matrix, at most: the others are put below."""
+"""Maximum methods side by side in a matrix; further ones go below."""
 
 
 class Shown(NamedTuple):
-    """A table as a reader sees it."""
+    """A table as displayed."""
 
     table: pd.DataFrame
-    """Texts, as LaTeX sets them."""
+    """Texts, as in the LaTeX file."""
     blocks: list[Block]
     words: int
-    """Columns at the left that hold words; the others hold numbers."""
+    """Number of text columns at the left; the others hold numbers."""
 
 
 def with_algorithm(row: Row) -> str:
-    """A setting in words, with the algorithm where it is not TD3+BC."""
+    """A setting in words, with the algorithm unless it is TD3+BC."""
     return setting(row) + ("" if row["algorithm"] == "td3_bc" else f", {row['algorithm']}")
 
 
@@ -41,13 +41,13 @@ def _count(row: Row) -> str:
 
 
 def _span(row: Row, cost: str) -> str:
-    """Mean, least and most seconds."""
+    """Mean, minimum and maximum of seconds."""
     low, high = row[f"{cost}_min"], row[f"{cost}_max"]
     return number(row[cost], 0) + (f" ({low:.0f} – {high:.0f})" if low < high else "")
 
 
 def _chance(row: Row) -> str:
-    """A probability with its interval, or the count of wins where one seed tells no probability."""
+    """A probability with its interval, or the number of wins if a single seed allows no probability."""
     if pd.isna(row["probability"]):
         return f"{row['wins']:g} of {row['pairs']}"
     few = "†" if row["seeds"] < FEW_SEEDS else ""
@@ -55,12 +55,12 @@ def _chance(row: Row) -> str:
 
 
 def claim_of(row: Row) -> str:
-    """A claim, with the family that it is judged in."""
+    """A claim, with its family."""
     return row["claim"] + (f" ({row['family']})" if row["family"] else "")
 
 
 def _p(row: Row) -> str:
-    """A p value, and the one that is adjusted for its family."""
+    """A p value, and the one adjusted for its family."""
     if pd.isna(row["p"]):
         return number(None)
     told = "" if pd.isna(row["adjusted_p"]) else f" ({row['adjusted_p']:.3f})"
@@ -68,7 +68,7 @@ def _p(row: Row) -> str:
 
 
 def _smallest(row: Row) -> str:
-    """The difference that would be found, and as a share of the data's return."""
+    """The smallest detectable difference, also as a percentage of the data's return."""
     share = "" if pd.isna(row["smallest_share"]) else f" ({100 * row['smallest_share']:.0f}%)"
     return number(row["smallest"], 0) + share
 
@@ -174,20 +174,19 @@ SHOWN: dict[str, Columns] = {
         "runs": "runs",
     },
 }
-"""Columns of the tables that the page shows. All but those of WHOLE are cut into one table for each value of the first
-column."""
+"""Columns of the page's tables. All tables except WHOLE are split by the values of their first column."""
 WORDS = {"gates": 3, "claims": 4, "lead": 3, "elsewhere": 2, "costs": 2}
-"""Columns at the left that hold words, where there is more than one."""
+"""Number of text columns at the left, if not 1."""
 WHOLE = ("gates", "costs")
 
 
 def shown_tables(made: dict[str, pd.DataFrame]) -> dict[str, Shown]:
-    """The tables that the page shows, by the name of their rows' file."""
+    """The page's tables, by the base name of their files."""
     found = {}
     for name, columns in SHOWN.items():
         rows, words = made[name], WORDS.get(name, 1)
         if name == "control" and rows["data_return"].isna().all() and rows["clean_return"].isna().all():
-            rows = rows.iloc[:0]  # nothing is known but the return as trained
+            rows = rows.iloc[:0]  # only the return as trained is known
         if name == "critics" and rows["critic_value"].isna().all():
             rows = rows.iloc[:0]
         table = texts(rows, columns)
@@ -196,7 +195,7 @@ def shown_tables(made: dict[str, pd.DataFrame]) -> dict[str, Shown]:
 
 
 def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame, words: int) -> Iterator[Block]:
-    """A table as the page shows it: cut by its first column, and a matrix of what is about two methods."""
+    """Split a table by its first column; comparisons of two methods become a matrix."""
     if name in WHOLE:
         note = seeds_note(rows["runs"], "run") if name == "costs" else ""
         yield from [block("", table, words, note)] if len(table) else []
@@ -218,7 +217,7 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame, words: int) -> I
             note = seeds_note(mine["seeds"])
             told = [method for method in dict.fromkeys(mine["method"]) if method in TOLD_STATES]
             if name == "representations" and told:
-                # A linear probe reads easily what the encoder was trained to tell.
+                # A linear probe trivially reads out what the encoder was trained to predict.
                 names = " and ".join(told)
                 note += f" {names}: trained on the states of all episodes, those that the probe holds out, too, but for"
                 note += " --hold-out."

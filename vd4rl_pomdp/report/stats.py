@@ -1,10 +1,10 @@
-"""Statistics over seeds and tasks. The seed is the replicate: episodes of one seed are averaged first, never pooled.
+"""Statistics over seeds and tasks. Seeds are the replicates: episodes are averaged per seed first, never pooled.
 
-The mean of one condition, and the difference of two, have 95% t intervals over two levels, seeds and episodes.
-Statistics over tasks (interquartile mean, optimality gap, performance profiles, probability of improvement) have
-percentile intervals of the stratified bootstrap of Agarwal et al. 2021 (arXiv 2108.13264): a task is a stratum, and
-each bootstrap sample draws every task's seeds anew, with replacement. How often both cover is in docs/reports.md. n
-always stands beside them, and of a single seed there is none.
+Means and differences of means have 95% t intervals over two levels, seeds and episodes. Statistics over tasks
+(interquartile mean, optimality gap, performance profiles, probability of improvement) have percentile intervals of the
+stratified bootstrap of Agarwal et al. 2021 (arXiv 2108.13264): tasks are strata, and each bootstrap sample redraws
+every task's seeds with replacement. docs/reports.md gives the coverage of both. n is always shown, and a single seed
+has no interval.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from scipy.special import stdtr, stdtrit
 FEW_SEEDS = 5
 """Intervals of fewer seeds are flagged."""
 REPLICATES = 20_000
-"""Bootstrap samples of an interval."""
+"""Bootstrap samples per interval."""
 LEVEL, POWER = 0.05, 0.8
-"""Two-sided level of every test and interval, and the power at which the smallest difference is told."""
+"""Two-sided level of all tests and intervals, and the power that defines the smallest detectable difference."""
 _LEVELS = (2.5, 97.5)
 """Percentiles of a 95% interval."""
 
@@ -29,7 +29,7 @@ Interval = tuple[float, float]
 Statistic = Callable[[np.ndarray], np.ndarray]
 """(..., runs) scores -> (...) values."""
 Strata = list[np.ndarray]
-"""Scores by seed, one (n_i,) array a task."""
+"""Scores by seed, one (n_i,) array per task."""
 
 
 def mean(scores: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def mean(scores: np.ndarray) -> np.ndarray:
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
-    """Interquartile mean over the last axis: the mean of the middle half, weights split at the quartiles."""
+    """Interquartile mean over the last axis: mean of the middle half, with fractional weights at the quartiles."""
     ordered = np.sort(scores, axis=-1)
     count = ordered.shape[-1]
     edges = np.arange(count + 1) / count
@@ -47,44 +47,45 @@ def iqm(scores: np.ndarray) -> np.ndarray:
 
 
 def optimality_gap(scores: np.ndarray, target: float = 100.0) -> np.ndarray:
-    """Mean shortfall from `target` over the last axis; scores above it count as it."""
+    """Mean shortfall from `target` over the last axis; scores above the target count as the target."""
     return target - np.minimum(scores, target).mean(-1)
 
 
 def aggregates(strata: Strata) -> dict[str, Statistic]:
-    """The statistics of all runs of a method, by name, for scores that hold those of each task in turn."""
+    """Statistics over all runs of a method, by name, for scores concatenated over tasks."""
     edges = np.cumsum([len(scores) for scores in strata])[:-1]
 
     def median(scores: np.ndarray) -> np.ndarray:
-        """Over tasks, of a task's mean."""
+        """Median over tasks of each task's mean."""
         return np.median(np.stack([part.mean(-1) for part in np.split(scores, edges, axis=-1)], axis=-1), axis=-1)
 
     return {"iqm": iqm, "median": median, "mean": mean, "optimality_gap": optimality_gap}
 
 
 def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """Share of runs (n,) above each threshold (k,)."""
+    """Fraction of runs (n,) above each threshold (k,)."""
     return (scores[:, None] > thresholds).mean(0)
 
 
 def probability_of_improvement(strata: Strata, others: Strata) -> float:
-    """Chance that a random run beats a random one of the others on the same task, averaged over tasks; ties count half.
+    """Probability that a random run beats a random run of the others on the same task, averaged over tasks; ties count
+    half.
 
-    Args:
-        strata: scores of one method, by task.
-        others: scores of another on the same tasks, in their order.
+        Args:
+            strata: scores of one method, by task.
+            others: scores of another method on the same tasks, in the same order.
     """
     return float(np.mean([_wins(one, other).mean() for one, other in zip(strata, others, strict=True)]))
 
 
 def _wins(scores: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(n, m): 1 where a run of (n,) scores is above one of (m,), 1/2 where they tie."""
+    """(n, m): 1 where a run of (n,) scores is above one of (m,), 1/2 for ties."""
     difference = scores[:, None] - others[None, :]
     return (difference > 0) + 0.5 * (difference == 0)
 
 
 def by_episode(seeds: Sequence[Sequence[float]]) -> np.ndarray:
-    """Scores of every seed's episodes as (seeds, episodes); as (seeds, 1) means where seeds have not equally many."""
+    """Scores as (seeds, episodes); or means as (seeds, 1) if seeds differ in their number of episodes."""
     if len(set(map(len, seeds))) == 1:
         return np.array(seeds, dtype=float)
     return np.array([[np.mean(episodes)] for episodes in seeds])
@@ -92,7 +93,7 @@ def by_episode(seeds: Sequence[Sequence[float]]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean or a difference of two, as Student's t has it."""
+    """A mean or a difference of two means, for Student's t."""
 
     value: float
     error: float
@@ -113,35 +114,35 @@ class Estimate:
 
     @property
     def smallest(self) -> float:
-        """Smallest true value that a test at 5% finds in 80% of cases, if error and degrees of freedom stay these."""
+        """Smallest true value that a 5% test detects with 80% power, at this error and these degrees of freedom."""
         return float(stdtrit(self.free, 1 - LEVEL / 2) + stdtrit(self.free, POWER)) * self.error
 
 
 def mean_interval(scores: np.ndarray) -> Interval | None:
     """95% t interval of the mean of (seeds, episodes) scores, over the seeds and the episodes that they share.
 
-    Three seeds that happen to agree do not make a mean surer than its episodes allow: both levels' squared standard
-    errors are added, with Welch and Satterthwaite's degrees of freedom. It is what a bootstrap of seeds and then of
-    episodes tends to, with the correction that so few seeds ask for.
+    Three seeds that happen to agree must not make the interval narrower than the episodes allow. So the squared
+    standard errors of both levels are added, with Welch-Satterthwaite degrees of freedom. This approximates a
+    bootstrap of seeds and then episodes, corrected for few seeds.
 
     Returns:
-        Lower and upper end; None for a single seed, and where no score differs from another, which tells nothing about
-        how far the next seed's would be.
+        Lower and upper end; None for a single seed, or if all scores are equal, since that says nothing about the
+        spread over seeds.
     """
     found = _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])
     return found.interval if found else None
 
 
 def difference_interval(scores: np.ndarray, others: np.ndarray) -> Interval | None:
-    """The same of the mean of (n, episodes) scores less that of (m, episodes) others."""
+    """Like `mean_interval`, for the mean of (n, episodes) scores minus that of (m, episodes) others."""
     found = difference(scores, others)
     return found.interval if found else None
 
 
 def difference(scores: np.ndarray, others: np.ndarray) -> Estimate | None:
-    """The mean of (n, episodes) scores less that of (m, episodes) others, over both levels; None as `mean_interval`.
+    """Mean of (n, episodes) scores minus that of (m, episodes) others, over both levels; None as in `mean_interval`.
 
-    Where both have equally many episodes, these are taken as pairs: evaluations of a task begin at the same states.
+    With equal numbers of episodes, these are paired: evaluations of a task start from the same states.
     """
     paired = scores.shape[1] == others.shape[1]
     episodes = [scores.mean(0) - others.mean(0)] if paired else [scores.mean(0), others.mean(0)]
@@ -149,7 +150,7 @@ def difference(scores: np.ndarray, others: np.ndarray) -> Estimate | None:
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """p values of a family of tests, adjusted by Holm 1979 in their order: at most 5% where all of them are none."""
+    """Holm-adjusted p values of a family of tests, in the given order (Holm 1979): family-wise error of at most 5%."""
     adjusted, highest = list(values), 0.0
     for rank, place in enumerate(sorted(range(len(values)), key=values.__getitem__)):
         highest = max(highest, (len(values) - rank) * values[place])
@@ -158,9 +159,9 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def _estimate(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarray]) -> Estimate | None:
-    """Of a sum of means, one for each array of values; the episodes' count where there are two or more."""
-    # No bootstrap: resampled means of three seeds spread by sqrt(2/3) standard errors, and their percentiles know no
-    # t distribution. Its 95% interval would hold the mean three times in four.
+    """Estimate of a sum of means, one per array. Arrays of episodes count if they have at least two values."""
+    # No bootstrap: resampled means of three seeds spread by only sqrt(2/3) standard errors, and percentiles ignore the
+    # t distribution. Its 95% interval would cover the mean only 3 times in 4.
     if _single(seeds):
         return None
     parts = [*seeds, *(part for part in episodes if len(part) > 1)]
@@ -168,27 +169,27 @@ def _estimate(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarray]
     free = np.array([len(part) - 1 for part in parts])
     if not errors.any():
         return None
-    # Welch and Satterthwaite: the degrees of freedom of a sum of variances, each known as well as its own count allows.
+    # Welch-Satterthwaite: effective degrees of freedom of a sum of estimated variances.
     return Estimate(float(middle), math.sqrt(errors.sum()), float(errors.sum() ** 2 / (errors**2 / free).sum()))
 
 
 def bootstrap_intervals(
     strata: Strata, statistics: Mapping[str, Statistic], rng: np.random.Generator, replicates: int = REPLICATES
 ) -> dict[str, Interval | None]:
-    """Percentile 95% intervals of statistics of all runs, by name, seeds drawn anew within each task.
+    """Percentile 95% intervals of statistics of all runs, by name; seeds are resampled within each task.
 
     Args:
-        strata: scores by seed, one (n_i,) array a task.
-        statistics: of (replicates, runs) scores.
+        strata: scores by seed, one (n_i,) array per task.
+        statistics: functions of (replicates, runs) scores.
         rng: source of the draws.
         replicates: bootstrap samples.
 
     Returns:
-        Lower and upper ends; None if a task has a single seed, which tells nothing about their spread.
+        Lower and upper ends; None if a task has a single seed, whose spread is unknown.
     """
     if _single(strata):
         return dict.fromkeys(statistics)
-    # Within tasks alone: what tells one task from another is no part of how far another seed would fall.
+    # Resample within tasks only: differences between tasks are not variation over seeds.
     drawn = [scores[rng.integers(len(scores), size=(replicates, len(scores)))] for scores in strata]
     samples = np.concatenate(drawn, axis=1)
     return {name: _ends(statistic(samples)) for name, statistic in statistics.items()}
@@ -210,7 +211,8 @@ def improvement_interval(
 def profile_band(
     strata: Strata, thresholds: np.ndarray, rng: np.random.Generator, replicates: int = REPLICATES
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pointwise 95% percentile band of the performance profile of all runs, two (k,) arrays; None as above."""
+    """Pointwise 95% percentile band of the performance profile of all runs, two (k,) arrays; None if a task has a
+    single seed."""
     if _single(strata):
         return None
     runs = sum(map(len, strata))
@@ -226,8 +228,8 @@ def _single(strata: Strata) -> bool:
 
 
 def _shares(count: int, rng: np.random.Generator, replicates: int) -> np.ndarray:
-    """(replicates, count): the share that each of `count` seeds has in a bootstrap sample."""
-    # A sample is told by how often it has each seed: statistics that are linear in it become one matrix product.
+    """(replicates, count): fraction of each bootstrap sample that each of `count` seeds makes up."""
+    # Statistics linear in these fractions become one matrix product.
     drawn = rng.integers(count, size=(replicates, count)) + count * np.arange(replicates)[:, None]
     return np.bincount(drawn.ravel(), minlength=replicates * count).reshape(replicates, count) / count
 
@@ -238,22 +240,22 @@ def _ends(values: np.ndarray) -> Interval:
 
 
 def mean_and_error(values: Sequence[float], digits: int = 0) -> str:
-    """In words: the mean and its standard error, or the mean alone of a single value."""
+    """In words: mean and standard error, or only the mean of a single value."""
     error = f" ± {np.std(values, ddof=1) / math.sqrt(len(values)):.{digits}f}" if len(values) > 1 else ""
     return f"{np.mean(values):.{digits}f}{error}"
 
 
 def number(value: float | None, digits: int = 1) -> str:
-    """A number, or a dash for one that is not known."""
+    """A number, or a dash if unknown."""
     return "–" if value is None or math.isnan(value) else f"{value:z.{digits}f}"
 
 
 def interval(low: float | None, high: float | None, digits: int = 1) -> str:
-    """An interval in brackets, or a dash."""
+    """An interval in brackets, or a dash if unknown."""
     known = low is not None and high is not None and not math.isnan(low)
     return f"[{low:z.{digits}f}, {high:z.{digits}f}]" if known else "–"
 
 
 def with_interval(value: float | None, low: float | None, high: float | None, digits: int = 1) -> str:
-    """A number and its interval, as far as they are known."""
+    """A number and its interval, as far as known."""
     return f"{number(value, digits)} {interval(low, high, digits)}".removesuffix(" –")

@@ -1,6 +1,6 @@
 """The tables of a report: group-bys of the frames of runs and of evaluations. Every figure shows one of them.
 
-CONDITION, the columns that all seeds of an experiment share, comes first. What is not known is missing.
+The columns CONDITION, which all seeds of an experiment share, come first. Unknown values are missing.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from vd4rl_pomdp.report.load import (
 from vd4rl_pomdp.runs.files import Row
 
 SCORE = "Score = return / 10 or the task's own divisor"
-"""What tables and pages say of their scores."""
+"""Explanation of scores on tables and pages."""
 SERIES = CONDITION[2:]
-"""What a method's runs on all tasks share."""
+"""Columns shared by a method's runs on all tasks."""
 THRESHOLDS = 101
 """Number of scores at which a performance profile is computed."""
 MANY = 2_000
-"""Bootstrap samples of each of the many intervals of a profile or a matrix."""
+"""Bootstrap samples per interval in a profile or matrix, which have many."""
 AGGREGATES = ("iqm", "median", "mean", "optimality_gap")
 POINTS = 200
-"""Points of a loss curve, at most."""
+"""Maximum points of a loss curve."""
 ENDS = ("", "_low", "_high")
 
 
 def evaluations(episodes: pd.DataFrame) -> pd.DataFrame:
-    """One row for every evaluation of a run as trained: IDENTITY, step, `score`, and `scores` of its episodes.
+    """One row per evaluation of a run as trained: IDENTITY, step, `score`, and `scores` of its episodes.
 
-    The seed is the replicate: the score is the mean over the evaluation's episodes.
+    `score` is the mean over the evaluation's episodes, as seeds are the replicates.
     """
     by_step = episodes[episodes["as_trained"]].groupby([*IDENTITY, "step"], sort=False)["score"]
     return by_step.agg(score="mean", scores=list).reset_index()
@@ -52,13 +52,13 @@ def evaluations(episodes: pd.DataFrame) -> pd.DataFrame:
 def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tuple[str, ...]] = ()) -> pd.DataFrame:
     """Scores of every condition, mean over seeds with 95% interval: of the last evaluation, and of the best one.
 
-    The highest score of a setting (task, quality, corruption) comes first, unless it is `unranked`: there names decide.
-    `absent` counts its seeds that are missing, unfinished or diverged, `missing` names them; a condition without any
-    finished seed has no numbers.
+    Within a setting (task, quality, corruption), rows are sorted by score, or by name if the setting is `unranked`.
+    `absent` counts seeds that are missing, unfinished or diverged, and `missing` names them. A condition without
+    finished seeds has no numbers.
 
     Args:
         evaluated: evaluations of finished runs.
-        gaps: of `find_gaps`.
+        gaps: from `find_gaps`.
         unranked: settings whose methods are not ranked.
     """
     rows = {condition: _scores(seeds) for condition, seeds in evaluated.groupby(list(CONDITION), sort=False)}
@@ -77,7 +77,7 @@ def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tu
     )
     table = pd.DataFrame(found, columns=list(columns))
     places = table[list(SETTING)].itertuples(index=False, name=None)
-    # Where a gate is missed an order by score would be read as a ranking of methods.
+    # If a gate fails, sorting by score would suggest a ranking of methods.
     by_name = pd.Series([place in unranked for place in places], table.index, dtype=bool)
     return _ordered(table, -table["score"].astype(float).mask(by_name, 0.0), labels(table))
 
@@ -101,34 +101,33 @@ def mean_and_ends(scores: np.ndarray, prefix: str = "", suffix: str = "") -> Row
 
 
 def _ordered(table: pd.DataFrame, *keys: pd.Series) -> pd.DataFrame:
-    """By setting, references last, then by some keys; what is not known stands at the end."""
+    """Sort by setting, then references last, then by some keys; unknown values last."""
     columns = [table[name] for name in SETTING if name in table] + [table["method"].isin(REFERENCES), *keys]
     order = pd.concat(columns, axis=1, ignore_index=True).pipe(lambda told: told.sort_values(list(told), kind="stable"))
     return table.loc[order.index].reset_index(drop=True)
 
 
 def curves(evaluated: pd.DataFrame) -> pd.DataFrame:
-    """Mean over seeds, and their range, at every evaluation."""
+    """Mean and range over seeds at every evaluation."""
     by_step = evaluated.groupby([*CONDITION, "step"])["score"]
     return by_step.agg(score="mean", low="min", high="max", seeds="size").reset_index()
 
 
 def final_scores(evaluated: pd.DataFrame) -> pd.DataFrame:
-    """The last evaluations of every condition, a row a seed."""
+    """Last evaluations of every condition, one row per seed."""
     return evaluated[evaluated["step"] == evaluated.groupby(list(CONDITION), sort=False)["step"].transform("max")]
 
 
 def _strata(finals: pd.DataFrame) -> stats.Strata:
-    """Final score of every seed, one array a task and quality."""
+    """Final score of every seed, one array per task and quality."""
     return [seeds.to_numpy() for _, seeds in finals.groupby(["task", "quality"], sort=False)["score"]]
 
 
 def aggregate(evaluated: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
     """AGGREGATES over the tasks and qualities of every method and corruption, with stratified 95% intervals.
 
-    `of_tasks` is the number of tasks and qualities under the corruption: a row with fewer `tasks` cannot be compared
-    with the others, and stands below them. `seeds` is the least number that a task has. A method that has not been run
-    has no numbers.
+    `of_tasks` is the number of tasks and qualities under the corruption. A row with fewer `tasks` is not comparable
+    and goes below the others. `seeds` is the minimum over tasks. A method without runs has no numbers.
     """
     finals = final_scores(evaluated)
     everything = pd.concat([finals[list(CONDITION)], gaps[list(CONDITION)]])
@@ -148,7 +147,7 @@ def aggregate(evaluated: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
 
 def _aggregates(strata: stats.Strata) -> Row:
     scores, chosen = np.concatenate(strata), stats.aggregates(strata)
-    # Always the same draws: the same rows make the same page, to the byte.
+    # Fixed seed: equal rows give a byte-identical page.
     intervals = stats.bootstrap_intervals(strata, chosen, np.random.default_rng(0))
     found: Row = {}
     for name, statistic in chosen.items():
@@ -160,8 +159,8 @@ def _aggregates(strata: stats.Strata) -> Row:
 def improvement(evaluated: pd.DataFrame) -> pd.DataFrame:
     """Probability that a run of one method beats one of another on the same task, averaged over common tasks.
 
-    A probability has a stratified 95% interval; where a method has a single seed on some task there is none, as one
-    pair of runs tells no probability. `wins` of `pairs` of runs are known in any case; ties count half.
+    Has a stratified 95% interval. If a method has a single seed on some task, there is neither probability nor
+    interval, only `wins` out of `pairs` of runs, which are always given. Ties count half.
     """
     rows: list[Row] = []
     finals = final_scores(evaluated)
@@ -194,9 +193,9 @@ def _improvement(strata: stats.Strata, others: stats.Strata) -> Row:
 
 
 def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
-    """Share of runs (all tasks and seeds of a method) whose final score is above each threshold, with 95% bands.
+    """Fraction of runs (all tasks and seeds of a method) whose final score is above each threshold, with 95% bands.
 
-    Thresholds go from 0, or the lowest score below it, to 100, or to 0 where no score is above it.
+    Thresholds range from 0 (or the lowest score, if negative) to 100 (or 0, if no score is positive).
     """
     finals = final_scores(evaluated)
     top = 100 if (finals["score"] > 0).any() or not (finals["score"] < 0).any() else 0
@@ -212,15 +211,15 @@ def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
 
 
 def all_runs(runs: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
-    """The frame of runs, and rows with a state but no numbers for those that are missing or did not finish."""
+    """The frame of runs, plus rows with a state but no numbers for missing and unfinished runs."""
     table = pd.DataFrame(runs.to_dict("records") + gaps.to_dict("records"), columns=runs.columns)
     return _ordered(table, -table["score"].astype(float))
 
 
 def representations(table: pd.DataFrame) -> pd.DataFrame:
-    """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and the gaps.
+    """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and its gaps.
 
-    What a seed does not know is missing.
+    A mean is missing if any seed lacks the value.
     """
     means = _means(table[table["score"].notna()], ["action_loss", *PROBES, "return", *COSTS])
     gaps = [
@@ -232,14 +231,15 @@ def representations(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _means(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
-    """Means of some columns by condition, each known only if all seeds know it, and how many `seeds` there are."""
+    """Means of some columns by condition, missing if any seed lacks the value, and the number of `seeds`."""
     grouped = table.groupby(list(CONDITION), sort=False)
     means = grouped[names].agg(lambda column: column.astype(float).mean(skipna=False))
     return means.assign(seeds=grouped.size()).reset_index()
 
 
 def costs(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean, least and most seconds of both stages by method, over all finished runs of a table, and their machines."""
+    """Mean, minimum and maximum seconds of both stages by method, over all finished runs of a table, and their
+    machines."""
     finished = table[table["score"].notna()]
     grouped = finished.assign(method=labels(finished)).groupby("method", sort=False)
     spans = {
@@ -252,9 +252,9 @@ def costs(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def control(table: pd.DataFrame) -> pd.DataFrame:
-    """What the policies of every condition do, beside the data they learned from: means over the finished seeds.
+    """Control performance of every condition and of its data: means over the finished seeds.
 
-    Return, share of episodes above 80% of the data's return, and action error in closed loop are those of the last
+    Return, fraction of episodes above 80% of the data's return, and closed-loop action error are from the last
     evaluation: as trained, and under no corruption (`clean_`).
     """
     names = ["data_return", *CONTROL, *(f"clean_{name}" for name in CONTROL), "path_error"]
@@ -263,10 +263,10 @@ def control(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def elsewhere(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Scores of the last policies under corruptions that they were not trained under, but for none: mean over seeds.
+    """Scores of the final policies under other corruptions than in training, except none: mean over seeds.
 
     Args:
-        episodes: of finished runs, as `episodes_frame` has them.
+        episodes: of finished runs, from `episodes_frame`.
     """
     last = episodes["step"] == episodes.groupby("id")["step"].transform("max")
     others = episodes[last & ~episodes["as_trained"] & (episodes["evaluated_under"] != "none")]
@@ -280,10 +280,10 @@ def elsewhere(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def critics(table: pd.DataFrame) -> pd.DataFrame:
-    """What the critics of every condition came to, beside the data's own discounted return: means over finished seeds.
+    """Critic values of every condition and the data's own discounted return: means over finished seeds.
 
-    `critic_moved` is the mean of how far they moved either way, `converged` how many converged; what one seed does not
-    know is missing. Algorithms without a critic have no row.
+    `critic_moved` is the mean absolute drift, `converged` the number of converged critics; both are missing if any
+    seed lacks the value. Algorithms without a critic have no row.
     """
     known = table["critic_value"].notna() | table["converged"].isna()
     mine = table[table["score"].notna() & known]
@@ -292,10 +292,11 @@ def critics(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:
-    """Mean action loss over the pretraining runs of every condition, at most POINTS of the steps that all tell of.
+    """Mean action loss over the pretraining runs of every condition, at up to POINTS of the steps that all of them
+    logged.
 
-    Args:
-        curves: IDENTITY of each finished pretraining, and its losses by step.
+        Args:
+            curves: IDENTITY of each finished pretraining, and its losses by step.
     """
     rows = [named | {"step": step, "action_loss": loss} for named, told in curves for step, loss in told]
     parts = [pd.DataFrame(columns=[*CONDITION, "step", "action_loss", "seeds"])]

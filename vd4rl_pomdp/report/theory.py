@@ -1,4 +1,4 @@
-"""The section of the page, the page of its own and the terminal tables about exact finite worlds."""
+"""Results of the theory study on exact finite worlds: report section, its own page and terminal tables."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from vd4rl_pomdp.report.render import render
 from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
 
 Study = dict[str, Any]
-"""What `studies.theory.theory_study` returns."""
+"""Return value of `studies.theory.theory_study`."""
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
 LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
 
 
 def write_theory(study: Study, out: Path) -> Path:
-    """Write the study as a page and as JSON into a folder that exists; returns the page."""
+    """Write the study as a page and as JSON into an existing folder; returns the page."""
     write_json(out / FILE, study)
     write_text(out / "index.html", render("theory.html", theory=section(study)))
     return out / "index.html"
 
 
 def load_section(paths: list[Path]) -> str | None:
-    """The section about the study that `write_theory` left at or below some paths, if there is one."""
+    """Section about the study that `write_theory` left at or below some paths; None without one."""
     files = sorted({file.resolve(): file for path in paths for file in files_below(path, FILE)}.values())
     if len(files) > 1:
         raise UserError(f"{files[0]} and {files[1]}: two studies of the theory; report one of them")
@@ -52,7 +52,7 @@ def load_section(paths: list[Path]) -> str | None:
 
 
 def section(study: Study) -> str:
-    """The section about a study, in HTML."""
+    """The HTML section about a study."""
     shown = {
         "study": study,
         "columns": COLUMNS,
@@ -65,14 +65,14 @@ def section(study: Study) -> str:
 
 
 def by_title(study: Study) -> dict[str, list[Row]]:
-    """The rows of each fact, which are told of worlds."""
+    """The rows of each fact, one per world."""
     return {title: list(rows) for title, rows in groupby(study["facts"], key=lambda fact: fact["title"])}
 
 
 def table_rows(study: Study) -> list[Row]:
-    """Table 1 by method: for each column the printed entry, then each world's.
+    """Table 1 by method: in each column the paper's printed entry, then one per world.
 
-    Entries are bracketed where the method's assumptions fail, so that the paper claims nothing.
+    Entries are in parentheses where the method's assumptions fail, so that the paper makes no claim.
     """
     rows = []
     for worlds in zip(*study["tables"].values(), strict=True):
@@ -88,7 +88,7 @@ def table_rows(study: Study) -> list[Row]:
 
 
 def print_theory(study: Study) -> None:
-    """The study's main tables on the terminal."""
+    """Print the study's main tables on the terminal."""
     console, facts = Console(), by_title(study)
     appendix = study["counterexample"]["appendix"]
     table = Table(box=None, padding=(0, 2, 0, 0))
@@ -121,7 +121,7 @@ def print_theory(study: Study) -> None:
 
 
 def diagram_figure(study: Study) -> Figure:
-    """The counterexample, one panel an objective: one colour for states that a coarsest partition merges.
+    """The counterexample, one panel per objective. States merged by a coarsest partition share a colour.
 
     Arrows are transitions, labelled by their action.
     """
@@ -145,7 +145,7 @@ def _draw(axes: Axes, diagram: dict[str, Any], states: list, transitions: list) 
 
 
 def _position(position: int, last: int) -> tuple[float, float]:
-    """States that +1 leads to sit on the outer ring, clockwise by s^A, the others within, beside their successors.
+    """Place states reached by +1 on the outer ring, clockwise by s^A, and the others inside, beside their successors.
 
     (x, +1) leads to (x-1, -1) and back, so these two share an angle and no two arrows cross.
     """
@@ -154,7 +154,7 @@ def _position(position: int, last: int) -> tuple[float, float]:
 
 
 def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], action: int) -> None:
-    """A bent arrow with its action at the middle of the bend; +1 and -1 differ in colour."""
+    """A curved arrow, labelled with its action at mid-curve; +1 and -1 differ in colour."""
     bend, colour = -0.18, ("#222222" if action > 0 else "#999999")
     style = {"arrowstyle": "-|>", "color": colour, "shrinkA": 12, "shrinkB": 12, "connectionstyle": f"arc3,rad={bend}"}
     axes.annotate("", end, start, arrowprops=style, zorder=1)

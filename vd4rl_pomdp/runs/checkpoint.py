@@ -1,7 +1,7 @@
-"""Checkpoints: the two newest states of a run, each a file of `torch.save`, read with `weights_only`.
+"""Checkpoints: the two newest states of a run, one `torch.save` file each, read with `weights_only`.
 
-A checkpoint is written under a hidden name, flushed to the disk, and renamed when it is whole: a process that is
-killed at any moment leaves the newest whole one as it was. A zip's checksums tell damaged ones.
+A checkpoint is written under a hidden name, flushed to disk and then renamed, so a process killed at any moment leaves
+the previous one intact. Damage is detected by the zip's checksums.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import synchronise, write_bytes
 
 KEPT = 2
-"""Checkpoints that are kept: a damaged newest one costs the steps since the one before."""
+"""Checkpoints to keep. If the newest is damaged, only the steps since the one before are lost."""
 State = dict[str, Any]
-"""Nested dicts, lists and tuples of tensors, Python's numbers, words, and None."""
+"""Nested dicts, lists and tuples of tensors, numbers, strings and None."""
 
 
 class Checkpoints:
@@ -34,26 +34,27 @@ class Checkpoints:
         self._folder = run / "checkpoints"
 
     def add(self, step: int, state: State, seconds: float) -> None:
-        """Keep a state, reached after so many seconds, as the checkpoint after `step`; drop all but the newest KEPT."""
+        """Save a state reached after `seconds` as the checkpoint of `step`, and delete all but the newest KEPT."""
         with disk_errors(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
             write_bytes(self._path(step), pack({"format": FORMAT, "seconds": round(seconds, 2), "state": state}))
-            synchronise(self._folder)  # before the oldest goes: a power cut would else leave neither
+            synchronise(self._folder)  # before deleting the oldest: otherwise a power cut could lose both
             self.prune(KEPT)
 
     def restore(self, take: Callable[[State], None]) -> float | None:
-        """Hand the newest whole state to `take`; the seconds it was reached after, None without any checkpoint.
+        """Pass the newest undamaged state to `take`. Return the run's seconds at that point, or None without
+        checkpoints.
 
-        Raises:
-            UserError: there are some, but none is whole, or they are of another format or run, or not readable.
+                Raises:
+                    UserError: all checkpoints are damaged or unreadable, or belong to another format or run.
         """
-        # A disk may give back other bytes than it took: the one before is worth more than a run begun again.
+        # Disks corrupt files; falling back to the previous checkpoint beats starting over.
         damaged: dict[Path, str] = {}
         for path in map(self._path, self.steps()):
             content = read_bytes(path)
             try:
                 found = unpack(content)
-            except Exception as error:  # whatever a damaged file leads zipfile and torch to
+            except Exception as error:  # zipfile and torch raise anything on a damaged file
                 damaged[path] = first_line(error)
                 continue
             for other, problem in damaged.items():
@@ -81,13 +82,13 @@ class Checkpoints:
         return None
 
     def prune(self, kept: int) -> None:
-        """Drop all but the newest `kept` checkpoints, and the remains of interrupted writes."""
+        """Delete all but the newest `kept` checkpoints, and leftovers of interrupted writes."""
         with disk_errors(self._folder):
             for path in [*self._folder.glob(".*.tmp"), *map(self._path, self.steps()[kept:])]:
                 path.unlink()
 
     def steps(self) -> list[int]:
-        """Steps that have a checkpoint, the newest first."""
+        """Steps that have a checkpoint, newest first."""
         with disk_errors(self._folder):
             files = self._folder.iterdir() if self._folder.is_dir() else ()
             return sorted(
@@ -99,22 +100,22 @@ class Checkpoints:
 
 
 def pack(state: State) -> bytes:
-    """A state as a checkpoint's content; raises UserError for what `unpack` would refuse."""
+    """Serialise a state; UserError for types that `unpack` would reject."""
     content = io.BytesIO()
     torch.save(_copied(state, ""), content)
     return content.getvalue()
 
 
 def unpack(content: bytes) -> State:
-    """The state that was packed, on the CPU; raises some exception for damaged content."""
-    if damaged := zipfile.ZipFile(io.BytesIO(content)).testzip():  # torch checks no sums
+    """Deserialise a state onto the CPU; raises an exception of any kind for damaged content."""
+    if damaged := zipfile.ZipFile(io.BytesIO(content)).testzip():  # torch.load does not verify checksums
         raise ValueError(f"{damaged} is not what was written")
     state: State = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     return state
 
 
 def _copied(node: Any, place: str) -> Any:
-    """A copy on the CPU in which a part of a large tensor does not bring the whole along."""
+    """Copy to the CPU. Cloning keeps a view from saving its whole storage."""
     if isinstance(node, Tensor):
         return node.detach().cpu().contiguous().clone()
     if isinstance(node, dict):

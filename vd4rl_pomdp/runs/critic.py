@@ -1,4 +1,4 @@
-"""Whether a critic has converged: its mean value over the data, at the end of a training."""
+"""Whether a critic has converged, judged by its mean Q-value over the data at the end of training."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ import numpy as np
 from vd4rl_pomdp.runs.metrics import Metrics
 
 VALUE = "q"
-"""What algorithms with a critic call its mean value over a batch in their logs."""
+"""Name under which algorithms log the critic's mean value over a batch."""
 TOLD = {"value", "moved", "data"}
-"""What critic.json tells of an algorithm with a critic; of others nothing."""
+"""Keys of critic.json for an algorithm with a critic; for others it is empty."""
 CONVERGED = 0.02
-"""A critic has converged if it moved by less than this share of its value over the last fifth of the updates."""
+"""A critic has converged if its value moved by less than this fraction over the last fifth of the updates."""
 FEWEST = 3
-"""Rows that a line is fitted to, at least: two would lie on it."""
+"""Minimum number of rows for the line fit: two points always fit."""
 
 
 def critic_of(
     rows: Sequence[Metrics], updates: int, mean_reward: float | None, gamma: float | None
 ) -> dict[str, float | None]:
-    """What a trained run tells of its critic; empty for an algorithm without one, which logs no VALUE.
+    """Convergence summary of a run's critic; empty for an algorithm without one, which does not log VALUE.
 
     Args:
-        rows: of its metrics, VALUE a mean over the updates since the row before.
-        updates: of the whole training.
-        mean_reward: of the data, a decision.
-        gamma: the critic's discount of a decision; None if the algorithm has no such option.
+        rows: rows of metrics; VALUE is a mean over the updates since the previous row.
+        updates: total updates of the training.
+        mean_reward: mean reward per decision in the data.
+        gamma: the critic's discount per decision; None if the algorithm has no such option.
 
     Returns:
         `value`: mean of VALUE over the rows of the last fifth of the updates.
-        `moved`: how far it moved over that fifth, as a share of `value`: the slope of the line through these rows by
-            least squares, times a fifth of the updates, over `value`. None for fewer than FEWEST rows, or a value of 0.
-        `data`: the data's own discounted return, mean_reward / (1 - gamma), which the value of their policy comes to
-            in a task that does not end, whatever `n_step` is. None if it is not known.
+        `moved`: relative drift over that fifth: least-squares slope over these rows, times a fifth of the updates,
+        divided by `value`. None with fewer than FEWEST rows or a value of 0.
+        `data`: discounted return of the data, mean_reward / (1 - gamma): the value of the behaviour policy in a
+        task that never ends, for any `n_step`. None if unknown.
     """
     told = [(row["step"], row[VALUE]) for row in rows if VALUE in row and row["step"] > updates - updates / 5]
     if not told:

@@ -1,4 +1,4 @@
-"""Where tensors live and in which precision the networks run."""
+"""Device of the tensors and precision of the networks."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from vd4rl_pomdp.core.errors import UserError
 
 Precision = Literal["fp32", "tf32", "bf16"]
-"""Of matrix products. tf32: on a GPU their factors have 10 bits of mantissa, as JAX's do by default; elsewhere fp32."""
+"""Precision of matrix products. tf32: on a GPU, inputs have 10 mantissa bits, as is JAX's default; elsewhere fp32."""
 
 
 def pick_device(name: str) -> torch.device:
-    """Device called `name`; `auto` is the first GPU where there is one, else the CPU."""
+    """Device named `name`; `auto` is the first GPU if there is one, else the CPU."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -28,17 +28,17 @@ def pick_device(name: str) -> torch.device:
 
 
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
-    """Context in which a forward pass runs in `precision`, and its gradients are computed in it, too.
+    """Context in which a forward pass and its gradients run in `precision`.
 
-    bf16 products are of bf16 numbers, summed in fp32 and rounded; norms and the like stay in fp32.
+    bf16 products are accumulated in fp32 and rounded to bf16; norms and similar operations stay in fp32.
     """
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
 
 
 def set_products(device: torch.device, precision: Precision) -> None:
-    """Let matrix products of float32 on a GPU be of `precision` from now on, gradients included, in this process.
+    """Set the precision of float32 matrix products on a GPU, gradients included, for the rest of this process.
 
-    PyTorch's convolutions and recurrent layers are in TF32 on a GPU whatever is set here.
+    PyTorch runs convolutions and recurrent layers in TF32 on a GPU regardless of this setting.
     """
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")

@@ -1,4 +1,4 @@
-"""A run's `episodes.csv`: raw rows, one an evaluation episode, which are the result."""
+"""A run's `episodes.csv`: the raw results, one row per evaluation episode."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vd4rl_pomdp.core.reading import damaged, read_bytes, regular
 from vd4rl_pomdp.runs.files import Row, appending, write_csv
 
 EVALUATION_SEED = 20_000
-"""Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
+"""Evaluation episode i uses environment seed EVALUATION_SEED + i, for every method and training seed."""
 _WHOLE = ("seed", "step", "episode", "episode_seed", "length")
 COLUMNS = (
     *(*LABELS, "step", "episode", "episode_seed", "return", "length", "score"),
@@ -23,24 +23,26 @@ COLUMNS = (
 
 
 def append_episodes(path: Path, rows: list[Row]) -> None:
-    """Append rows to an `episodes.csv`, which gets a header first; without rows it is begun, or found to be writable.
+    """Append rows to an `episodes.csv`, creating it with a header if needed. Without rows, this checks that it is
+    writable.
 
-    Raises:
-        UserError: the file cannot be written, is of another kind, or is damaged; it stays as it is.
+        Raises:
+            UserError: the file cannot be written, is of another kind, or is damaged. It is left unchanged.
     """
     there = read_episodes(path)
     with appending(path) as file:
         writer = csv.DictWriter(file, list(there[0]) if there else COLUMNS, lineterminator="\n")
-        if not os.fstat(file.fileno()).st_size:  # asked while nobody else can write it
+        if not os.fstat(file.fileno()).st_size:  # checked under the file lock
             writer.writeheader()
         writer.writerows(rows)
 
 
 def read_episodes(path: Path) -> list[Row]:
-    """Rows of an `episodes.csv`, numbers parsed, none if there is no file or it is empty; other columns stay text.
+    """Rows of an `episodes.csv`, with numeric columns parsed and others left as text; empty if the file is missing or
+    empty.
 
-    Raises:
-        UserError: the file was not written by this package, or is damaged.
+        Raises:
+            UserError: the file was not written by this package, or is damaged.
     """
     if not regular(path).is_file():
         return []
@@ -48,7 +50,7 @@ def read_episodes(path: Path) -> list[Row]:
 
 
 def episodes_until(path: Path, step: int) -> list[Row]:
-    """Rows of the evaluations up to a step, none if there is no file; a last line that is not whole is left out."""
+    """Rows of evaluations up to `step`; empty without a file. A truncated last line is skipped."""
     if not path.exists():
         return []
     whole, end, _ = read_bytes(path).rpartition(b"\n")
@@ -56,7 +58,7 @@ def episodes_until(path: Path, step: int) -> list[Row]:
 
 
 def drop_episodes_after(path: Path, step: int) -> None:
-    """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
+    """Delete evaluations that an interrupted run made after its last checkpoint, and a truncated last line."""
     if kept := episodes_until(path, step):
         write_csv(path, list(kept[0]), kept)
     else:

@@ -1,4 +1,4 @@
-"""Read and write whole files, with the permissions that the umask leaves."""
+"""Read and write whole files atomically, with the permissions given by the umask."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 
 Row = dict[str, Any]
-"""One row of a table, its values by column."""
+"""One row of a table: values by column."""
 Member = TypeVar("Member")
 Key = TypeVar("Key", bound=Hashable)
 
 
 def jsonable(value: Any) -> Any:
-    """Config values as JSON: paths become strings, tuples become lists."""
+    """Config values as JSON types: paths become strings, tuples become lists."""
     if isinstance(value, dict):
         return {k: jsonable(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -32,7 +32,7 @@ def jsonable(value: Any) -> Any:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; raises UserError if it is missing, not readable or damaged."""
+    """Read a JSON object; UserError if it is missing, unreadable or damaged."""
     with damaged(path, "cannot be read as JSON"):
         value = parse_json(read_bytes(path))
     if not isinstance(value, dict):
@@ -41,13 +41,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, value: Any, shared: bool = False) -> None:
-    """Write a JSON file so that a reader sees it whole or not at all; `shared` as in `replacing_file`."""
+    """Write a JSON file atomically; `shared` as in `replacing_file`."""
     with replacing_file(path, shared) as fresh:
         fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
-    """Write a CSV file, its header first, so that a reader sees it whole or not at all."""
+    """Write a CSV file with a header, atomically."""
     with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
@@ -55,40 +55,40 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
 
 
 def content_hash(told: Any) -> str:
-    """Name of what can be written as JSON, 24 characters."""
+    """Hash of anything JSON-serialisable, 24 hex characters."""
     return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file, which is not held in memory."""
+    """Hexadecimal SHA-256 of a file, read in chunks."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees it whole or not at all."""
+    """Write a file atomically."""
     with replacing_file(path) as fresh:
         fresh.write_bytes(content)
 
 
 @contextmanager
 def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
-    """A hidden name beside `path` to write, which takes `path`'s place when the block ends, or goes if it fails.
+    """Yield a hidden temporary path next to `path`, renamed to `path` when the block ends and deleted if it fails.
 
     Args:
         path: the file.
-        shared: whether other processes may write it at the same time, so that each needs a hidden name of its own; what
-            a killed one leaves is then not written over.
+        shared: whether other processes may write it at the same time. Each then uses its own temporary name, which
+            is left behind if the process is killed.
 
     Raises:
-        UserError: the disk is full, or the system refuses otherwise.
+        UserError: the disk is full, or the system refuses for another reason.
     """
     own = f".{secrets.token_hex(4)}" if shared else ""
     fresh = path.with_name(f".{path.name}{own}.tmp")
     with disk_errors(path):
         try:
             yield fresh
-            # The content before the name: renamed first, a power cut could leave the name on an empty file.
+            # Flush the content before renaming, or a power cut could leave the name with an empty file.
             synchronise(fresh)
             fresh.replace(path)
         finally:
@@ -97,15 +97,16 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[IO[str]]:
-    """A text file to append lines to, which are on the disk when the block ends: a checkpoint may tell of them.
+    """Open a text file for appending; its lines are flushed to disk when the block ends, since a checkpoint may rely on
+    them.
 
-    Where the system can, a process that appends to the same file waits.
+        Concurrent writers wait for each other where the file system supports locks.
 
-    Raises:
-        UserError: the system refuses.
+        Raises:
+            UserError: the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
-        with suppress(OSError):  # not on every file system
+        with suppress(OSError):  # some file systems have no locks
             fcntl.flock(file.fileno(), fcntl.LOCK_EX)
         yield file
         file.flush()
@@ -113,7 +114,7 @@ def appending(path: Path) -> Iterator[IO[str]]:
 
 
 def synchronise(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
+    """fsync a file, or a folder's directory entries."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -122,9 +123,9 @@ def synchronise(path: Path) -> None:
 
 
 def files_below(folder: Path, name: str) -> list[Path]:
-    """Every file of a name at or below a folder, sorted; links to folders are followed, each folder counts once."""
+    """Every file of that name at or below a folder, sorted. Follows symlinks; visits each folder once."""
     found, seen, starts = [], set[str](), [folder]
-    for start in starts:  # what links name comes after what lies there
+    for start in starts:  # links are visited after the real folders
         for place, folders, names in os.walk(start):
             real = os.path.realpath(place)
             if real in seen:
@@ -137,13 +138,13 @@ def files_below(folder: Path, name: str) -> list[Path]:
 
 
 def holds_anything(folder: Path) -> bool:
-    """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are left by cut commands."""
+    """Whether a folder exists and holds anything but hidden files, which interrupted commands leave behind."""
     with disk_errors(folder):
         return folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir())
 
 
 def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
-    """Members by key, keys in the order in which they first come."""
+    """Members grouped by key; keys in order of first occurrence."""
     found: dict[Key, list[Member]] = {}
     for member in members:
         found.setdefault(key(member), []).append(member)
@@ -151,7 +152,7 @@ def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key,
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dicts as one, keys joined by dots."""
+    """Flatten nested dicts into one, with keys joined by dots."""
     flat: dict[str, Any] = {}
     for key, item in value.items():
         flat |= flatten(item, f"{prefix}{key}.") if isinstance(item, dict) else {f"{prefix}{key}": item}

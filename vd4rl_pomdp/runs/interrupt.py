@@ -1,6 +1,6 @@
-"""Signals: the first Ctrl-C, SIGTERM or SIGHUP ends a command where nothing is lost, a second one ends it at once.
+"""Signals: the first Ctrl-C, SIGTERM or SIGHUP ends a command gracefully, a second one immediately.
 
-The first one is raised where it arrives, or within `deferred` at the next `check`: a training loop ends its step.
+The first is raised as an exception at once or, within `deferred`, at the next `check`, so that training ends its step.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C; the message says from where the run resumes, if it does."""
+    """Ctrl-C; the message says where the run will resume, if it can."""
 
 
 class Terminated(SystemExit):
-    """SIGTERM or a closed terminal, with the exit code that shells give SIGTERM; the message is in `reason`."""
+    """SIGTERM or a closed terminal, with a shell's exit code for SIGTERM; the message is in `reason`."""
 
     def __init__(self, reason: str = "") -> None:
         super().__init__(128 + signal.SIGTERM)
@@ -28,7 +28,7 @@ class Terminated(SystemExit):
 
 
 class _Signals:
-    """Whether signals are answered or wait in this process, and which of them arrived last."""
+    """State of this process: whether signals are handled or deferred, and which one arrived last."""
 
     handled = deferred = False
     arrived: int | None = None
@@ -36,13 +36,14 @@ class _Signals:
 
 @contextmanager
 def handled(second: signal.Handlers | None = None) -> Iterator[None]:
-    """Answer signals as the module says; what is ignored, as under nohup, stays so.
+    """Handle signals as described in the module docstring. Ignored signals stay ignored, e.g. SIGHUP under nohup.
 
-    Nested, or outside the main thread, this changes nothing.
+    Does nothing when nested or outside the main thread.
 
     Args:
-        second: what a second signal does: SIG_DFL on the command line, which kills the process even inside a library's
-            C code; SIG_IGN where whoever sent the first will kill the process himself; None: what it did before.
+        second: action for a second signal. SIG_DFL, used on the command line, kills the process even inside a
+            library's C code. SIG_IGN is for processes whose parent will kill them itself. None keeps the previous
+            handler.
     """
     if _Signals.handled or threading.current_thread() is not threading.main_thread():
         yield
@@ -51,11 +52,11 @@ def handled(second: signal.Handlers | None = None) -> Iterator[None]:
     before = {number: old for number, old in before.items() if old not in (None, signal.SIG_IGN)}
 
     def answer(number: int, frame: FrameType | None) -> None:
-        # Whoever presses Ctrl-C twice does not want to wait for a checkpoint.
+        # A second Ctrl-C means: do not wait for a checkpoint.
         for other, old in before.items():
             signal.signal(other, old if second is None else second)
         if sys.stderr.isatty():
-            sys.stderr.write("\x1b[?25h")  # a second signal leaves nobody to show the cursor again
+            sys.stderr.write("\x1b[?25h")  # show the cursor: after a second signal nobody would
         _Signals.arrived = number
         if not _Signals.deferred:
             check()
@@ -73,7 +74,8 @@ def handled(second: signal.Handlers | None = None) -> Iterator[None]:
 
 @contextmanager
 def deferred(value: bool = True) -> Iterator[None]:
-    """Within the block a signal waits for the next `check`, at the latest that at its end; False: it does not wait."""
+    """Within the block, signals wait for the next `check`, at the latest the one at its end. False: handle them at
+    once."""
     before, _Signals.deferred = _Signals.deferred, value
     try:
         if not value:
@@ -85,11 +87,11 @@ def deferred(value: bool = True) -> Iterator[None]:
 
 
 def asked() -> bool:
-    """Whether a signal has arrived and waits for an answer."""
+    """Whether a signal has arrived and is pending."""
     return _Signals.handled and _Signals.arrived is not None
 
 
 def check(reason: str = "") -> None:
-    """Raise Interrupted or Terminated if a signal has arrived; `reason` says from where the run resumes."""
+    """Raise Interrupted or Terminated if a signal has arrived; `reason` says where the run will resume."""
     if asked():
         raise Interrupted(reason) if _Signals.arrived == signal.SIGINT else Terminated(reason)

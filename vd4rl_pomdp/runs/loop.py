@@ -1,4 +1,4 @@
-"""The loop that every training shares: restore, count steps, log, save, and end on a signal without losing a step."""
+"""The loop that all trainings share: restore, count steps, log, save, and stop at a signal without losing a step."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ class Learner(Protocol):
     """What a loop trains."""
 
     step: int
-    """Steps done."""
+    """Steps done so far."""
 
     def state(self) -> State:
-        """Everything needed to resume to the bit."""
+        """Everything needed to resume bit-identically."""
 
     def restore(self, state: State) -> None:
         """Resume from `state`."""
 
 
 class Loop:
-    """The steps that are left of a training; made by `training`.
+    """The remaining steps of a training; created by `training`.
 
     for step in loop:
-        loop.add(losses_of_one_step())  # the body does the step and counts it in `learner.step`
+        loop.add(losses_of_one_step())  # the body does the step and increments `learner.step`
         if loop.due(config.log_every):
             loop.log("loss")
     """
@@ -45,28 +45,29 @@ class Loop:
         self._saved = learner.step
 
     def __iter__(self) -> Iterator[int]:
-        """Number of each step, which the loop's body does; its state is then saved if that is due, or a signal came."""
+        """Yield each step's number for the body to do. Afterwards saves a checkpoint if one is due or a signal
+        arrived."""
         return in_step([self], self._total)
 
     def due(self, every: int) -> bool:
-        """Whether the step just done is one of every so many, or the last."""
+        """Whether the step just done is a multiple of `every`, or the last one."""
         return self._learner.step % every == 0 or self._learner.step == self._total
 
     def add(self, logs: dict[str, Tensor]) -> None:
-        """Count the scalars of the step just done for the next row of metrics."""
+        """Add the scalars of the step just done to the next row of metrics."""
         self._means.add(logs)
 
     def log(self, *shown: str, **more: float) -> None:
-        """Write a row of metrics: means over the steps since the row before, and `more`.
+        """Write a row of metrics: means since the previous row, and `more`.
 
-        The numbers named in `shown`, or all, stand in the progress line.
+        The progress line shows the numbers named in `shown`, or all.
         """
         row = self._means.take() | more
         self._log.write(self._learner.step, row)
         self.show(**{name: row[name] for name in shown or row})
 
     def log_evaluation(self, row: dict[str, float]) -> None:
-        """Write what an evaluation after the step just done gave, by names that begin with `metrics.EVALUATION`."""
+        """Write the results of an evaluation after the step just done; names begin with `metrics.EVALUATION`."""
         self._log.write(self._learner.step, row)
 
     def show(self, **numbers: float) -> None:
@@ -74,27 +75,27 @@ class Loop:
         self._progress.advance(0, **numbers)
 
     def require_finite(self, module: nn.Module) -> None:
-        """Raise FloatingPointError if a weight is not finite: what the last step did stands in no row of metrics."""
+        """Raise FloatingPointError if a weight is not finite. Logged losses would miss damage done by the last step."""
         if not all(weights.isfinite().all() for weights in module.parameters()):
             raise FloatingPointError(f"{self._run.path}: weights are not finite after step {self._learner.step}")
 
 
 def in_step(loops: Sequence[Loop], until: int) -> Iterator[int]:
-    """Number of each step, up to `until`, of loops whose learners one body trains, all after the same step.
+    """Yield step numbers up to `until` for several loops whose learners are trained in lockstep by one body.
 
-    Loops that are taken out meanwhile are left alone.
+    Loops may be removed from `loops` while it runs.
     """
     while loops and loops[0]._learner.step < until:
         yield loops[0]._learner.step + 1
         for loop in loops:
             loop._progress.advance()
-        # Here alone is a step whole: weights, optimiser and random streams are all of the same step.
+        # Only here are weights, optimiser and random streams all of the same step.
         if interrupt.asked() or any(loop.due(loop._run.config["checkpoint_every"]) for loop in loops):
             save(loops)
 
 
 def save(loops: Sequence[Loop]) -> None:
-    """Keep the states of all after the step just done, and end here if a signal asks for it."""
+    """Save a checkpoint of every loop after the step just done, then exit if a signal is pending."""
     for loop in loops:
         step = loop._learner.step
         if step != loop._saved:
@@ -114,16 +115,16 @@ def training(
     labels: Mapping[str, Any],
     card: Mapping[str, Any] | None = None,
 ) -> Iterator[Loop]:
-    """Restore a learner from a run's newest checkpoint and open what its loop writes; signals wait for a step's end.
+    """Restore a learner from the run's newest checkpoint and open its logs. Signals wait for the end of a step.
 
     Args:
         run: the run.
         learner: what is trained.
-        title: what the progress line says; empty: it is not shown.
-        total: the step at which the loop ends.
-        unit: what the progress line counts.
-        labels: what names the run where it is tracked: method, task, quality, corruption.
-        card: what the encoder that it started from says of its pretraining, if there is one.
+        title: title of the progress line; empty: no progress line.
+        total: step at which the loop ends.
+        unit: unit of the progress line.
+        labels: names of the run for trackers: method, task, quality, corruption.
+        card: pretraining metadata of the encoder that the run uses, if any.
     """
     means = Means()
 

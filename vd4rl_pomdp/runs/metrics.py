@@ -1,6 +1,6 @@
-"""Rows of metrics: metrics.jsonl, one JSON object a line, appended as a run goes, and its mirrors.
+"""Rows of metrics in metrics.jsonl, one JSON object per line, and their mirrors.
 
-A mirror, wandb or TensorBoard, gets the rows of metrics.jsonl. What fails there warns once, and no run stops.
+A mirror (wandb or TensorBoard) gets the same rows. If it fails, it warns once and the run continues.
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ from vd4rl_pomdp.runs.run import RunFolder, recipe
 
 WandbMode = Literal["off", "offline", "online"]
 EVALUATION = "eval/"
-"""How the names of an evaluation's numbers begin: eval/return/CORRUPTION, eval/score/CORRUPTION."""
+"""Prefix of an evaluation's metrics: eval/return/CORRUPTION, eval/score/CORRUPTION."""
 PROJECT = "vd4rl-pomdp"
 INIT_TIMEOUT_S, FINISH_TIMEOUT_S = 30.0, 60.0
-"""How long wandb may wait for its server before the first row and after the last one."""
+"""Seconds that wandb may wait for its server before the first row and after the last one."""
 LONGEST = {"name": 128, "group": 128, "tags": 64}
-"""Characters that wandb accepts."""
+"""Maximum lengths that wandb accepts, in characters."""
 _MOST_ADDED = 1024
-"""Steps whose scalars wait for their sum."""
+"""Steps buffered before their scalars are summed."""
 Metrics = Mapping[str, float]
-"""One row: its `step`, and numbers by name."""
+"""One row: `step`, and numbers by name."""
 
 
 class Means:
-    """Means of scalars over the steps since the row before: of each over the steps that gave it."""
+    """Means of scalars over the steps since the previous row, each over the steps that logged it."""
 
     def __init__(self) -> None:
         self._sums: dict[str, tuple[Tensor, int]] = {}
-        """Of each scalar: its sum, float32, and how many steps gave it."""
+        """By scalar: its float32 sum, and the number of steps that logged it."""
         self._added: list[tuple[tuple[str, ...], Tensor]] = []
-        """Names and copies of the scalars of steps that are not in the sums yet."""
+        """Names and copies of the scalars of steps not summed yet."""
 
     def add(self, logs: dict[str, Tensor]) -> None:
-        """Count a step's scalars, each a tensor of one element; a GPU is not waited for.
+        """Add a step's scalars, each a one-element tensor, without a GPU sync.
 
         Raises:
-            UserError: one is called what a row calls something else.
+            UserError: a scalar's name is reserved.
         """
         if taken := [name for name in logs if name == "step" or name.startswith(EVALUATION)]:
             raise UserError(f"a scalar of the loss is called {taken[0]!r}, as something else is in {METRICS_FILE}")
         if logs:
             device = next(iter(logs.values())).device
             values = [value.detach().float().reshape(()).to(device) for value in logs.values()]
-            self._added.append((tuple(logs), torch.stack(values)))  # one operation; to sum would be one a scalar
+            self._added.append((tuple(logs), torch.stack(values)))  # one kernel; summing would take one per scalar
         if len(self._added) >= _MOST_ADDED:
             self._sum()
 
     def _sum(self) -> None:
-        """Add the steps' scalars to the sums, in order and in float32."""
+        """Add the buffered scalars to the sums, in order and in float32."""
         if not self._added:
             return
         columns: dict[str, list[np.float32]] = {}
@@ -78,24 +78,24 @@ class Means:
         self._added = []
 
     def take(self) -> dict[str, float]:
-        """The means, which begin anew."""
+        """Return the means and reset."""
         self._sum()
         means = {name: float(total) / steps for name, (total, steps) in self._sums.items()}
         self._sums = {}
         return means
 
     def state_dict(self) -> dict[str, tuple[Tensor, int]]:
-        """What `load_state_dict` takes."""
+        """State for `load_state_dict`."""
         self._sum()
         return dict(self._sums)
 
     def load_state_dict(self, state: dict[str, tuple[Tensor, int]]) -> None:
-        """Resume counting from `state_dict`."""
+        """Resume from `state_dict`."""
         self._sums, self._added = {name: (total, steps) for name, (total, steps) in state.items()}, []
 
 
 class Mirror(Protocol):
-    """Takes the rows that metrics.jsonl gets; opening it hands it all rows so far."""
+    """Receives the rows written to metrics.jsonl; opening it hands over all rows so far."""
 
     def write(self, row: Metrics) -> None:
         """Take a row."""
@@ -107,7 +107,8 @@ class Mirror(Protocol):
 class MetricsLog:
     """Appends rows {"step": int, name: number, ...} to metrics.jsonl and its mirrors.
 
-    Opening it again at a checkpoint drops the rows after it: those of later steps, and an evaluation of its own step.
+    Reopening it at a checkpoint drops later rows, and evaluations at the checkpoint's own step, which will be
+    repeated.
     """
 
     def __init__(
@@ -117,11 +118,11 @@ class MetricsLog:
 
         Args:
             path: the metrics.jsonl.
-            step: the step that the run resumes from, 0 at its beginning.
-            mirrors: by name, what opens a mirror, given the rows up to that step: it may lack any.
+            step: step from which the run resumes; 0 for a new run.
+            mirrors: functions by name that open a mirror, given all rows up to `step`.
         """
         self._path = path
-        # The checkpoint's own step is trained, but not evaluated: that follows it, and is done again.
+        # The checkpoint's step is trained but not yet evaluated.
         kept = [
             row
             for row in read_metrics(path)
@@ -134,7 +135,7 @@ class MetricsLog:
                 self._mirrors[name] = mirror
 
     def write(self, step: int, metrics: Metrics) -> None:
-        """Append one row; a metric that is not a finite number raises FloatingPointError."""
+        """Append one row; FloatingPointError for a metric that is not finite."""
         bad = [name for name, value in metrics.items() if not math.isfinite(value)]
         if bad:
             raise FloatingPointError(f"{self._path.parent}: {bad[0]} is {metrics[bad[0]]} in the row of step {step}")
@@ -152,7 +153,7 @@ class MetricsLog:
     def _try(self, name: str, act: Callable[[], Any]) -> Any:
         try:
             return act()
-        except Exception as error:  # whatever a service or its library raises
+        except Exception as error:  # services and their libraries raise anything
             self._mirrors.pop(name, None)
             reason = in_one_line(error) or type(error).__name__
             reason += "; `pip install '.[tracking]'` in the package's folder" if isinstance(error, ImportError) else ""
@@ -161,7 +162,7 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
-    """Rows of a metrics.jsonl, none if there is no file; a last line that is not whole is left out.
+    """Rows of a metrics.jsonl; empty without a file. A truncated last line is skipped.
 
     Raises:
         UserError: a line is damaged.
@@ -181,12 +182,12 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
 def mirrors_of(
     run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]
 ) -> dict[str, Callable[[Sequence[Metrics]], Mirror]]:
-    """What opens the mirrors that a run's config asks for.
+    """Functions that open the mirrors enabled in a run's config.
 
     Args:
         run: the run.
-        labels: method, task, quality, corruption, and whatever else names the run.
-        card: what the encoder it started from says of its pretraining; empty for a pretraining run.
+        labels: method, task, quality, corruption, and other labels of the run.
+        card: pretraining metadata of its encoder; empty for a pretraining run.
     """
     found: dict[str, Callable[[Sequence[Metrics]], Mirror]] = {}
     if run.config["wandb"] != "off":
@@ -197,9 +198,9 @@ def mirrors_of(
 
 
 class Wandb:
-    """A wandb run, the same one whenever the run resumes; offline its files are then written anew, all rows included.
+    """A wandb run; resuming continues the same one. Offline, its files are rewritten with all rows on every resume.
 
-    wandb's own steps may not go back, as those of a run that was cut do: `step` is a number in each row instead.
+    wandb's own step counter cannot go back, as a resumed run does, so `step` is logged as a metric instead.
     """
 
     def __init__(
@@ -208,11 +209,11 @@ class Wandb:
         import wandb
 
         folder, online = run.path / "wandb", run.config["wandb"] == "online"
-        if not (folder / "id").exists():  # drawn: two runs of one recipe are two
+        if not (folder / "id").exists():  # random: two runs of one recipe are two wandb runs
             folder.mkdir(parents=True, exist_ok=True)
             write_bytes(folder / "id", secrets.token_hex(8).encode())
         name = (folder / "id").read_text(encoding="ascii").strip()
-        for earlier in folder.glob(f"offline-run-*-{name}"):  # a killed process leaves files that `wandb sync` refuses
+        for earlier in folder.glob(f"offline-run-*-{name}"):  # `wandb sync` rejects the files of a killed process
             shutil.rmtree(earlier)
         whole = run.config | dict(labels) | {"stage": run.stage, "inputs": run.inputs}
         self._run = wandb.init(
@@ -220,7 +221,7 @@ class Wandb:
             dir=str(run.path),
             mode=run.config["wandb"],
             id=name,
-            resume="allow" if online else None,  # offline the id alone tells
+            resume="allow" if online else None,  # offline the id suffices
             reinit="create_new",
             job_type=run.stage,
             config=whole | ({"pretraining": dict(card)} if card else {}),
@@ -236,7 +237,7 @@ class Wandb:
         self._run.define_metric("*", step_metric="step")
         sent = self._run.summary.get("step", 0) if online else 0
         for row in rows:
-            if row["step"] >= sent:  # the server may lack some of the last one's
+            if row["step"] >= sent:  # the server may lack metrics of its last step
                 self.write(row)
 
     def write(self, row: Metrics) -> None:
@@ -249,7 +250,7 @@ class Wandb:
 
 
 def wandb_names(run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
-    """`group`, equal for the seeds of one experiment, `name` and `tags` of a run."""
+    """wandb's `name`, `tags` and `group` of a run; seeds of one experiment share the group."""
     told = [str(value) for name, value in labels.items() if name != "seed" and value != ""]
     record = {"stage": run.stage, "config": run.config | {"seed": None}}
     mark = recipe(record, {**card, "seed": None} if card else {})[:6]
@@ -261,9 +262,9 @@ def wandb_names(run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, An
 
 
 class TensorBoard:
-    """An event file, written anew whenever the run resumes.
+    """An event file, rewritten whenever the run resumes.
 
-    Written by this thread: tensorboardX's own writer hands events to another one, and waits forever once that failed.
+    Written in this thread: tensorboardX's SummaryWriter uses a background thread and hangs forever if that fails.
     """
 
     def __init__(self, folder: Path, rows: Sequence[Metrics]) -> None:

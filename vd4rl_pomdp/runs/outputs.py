@@ -1,7 +1,7 @@
-"""Where a command may write: neither over another command's files, nor into their folder, nor beside another process.
+"""Where a command may write: not over or inside another command's results, nor where another process is writing.
 
-A folder belongs to the run, policy, encoder or data set in it. Every command checks its --out here first. While one is
-being written, its process owns it by a lock of the system's, which is free when that process has ended.
+A folder belongs to the run, policy, encoder or dataset in it, and every command checks its --out here first. While a
+process writes, it holds a file lock, which the system releases when the process ends.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from vd4rl_pomdp.runs.interrupt import handled
 
 LOCK = ".lock"
 _WAIT_S = 0.2
-"""`in_use` holds a free lock for a moment, which keeps nobody from owning the folder."""
+"""Wait for a lock in seconds: `in_use` briefly takes a free one, which must not stop its new owner."""
 
 
 def refuse_inside(out: Path) -> None:
-    """Raise UserError if a file or folder to write lies inside a run, a policy, an encoder or a data set."""
-    for folder in Path(os.path.realpath(out)).parents:  # unlike resolve, takes a link to itself as it is
+    """Raise UserError if a path to write lies inside a run, policy, encoder or dataset."""
+    for folder in Path(os.path.realpath(out)).parents:  # unlike resolve, accepts a symlink loop
         if what := kept_in(folder):
             raise UserError(f"{out}: lies inside {folder}, which holds {what}; choose another folder")
 
 
 def refuse_kept(out: Path) -> None:
-    """Raise UserError if a folder of runs or sets to write is itself a run, a policy, an encoder or a data set."""
+    """Raise UserError if a folder that will contain runs or datasets is itself one of these."""
     refuse_inside(out)
     if what := kept_in(out):
         raise UserError(f"{out}: holds {what}; choose another --out")
 
 
 def refuse_foreign(out: Path, what: str, *marks: str) -> None:
-    """Raise UserError unless a folder is missing or empty, or has been written by the same command before.
+    """Raise UserError unless a folder is missing, empty, or was written by the same command before.
 
     Args:
         out: folder to write.
         what: what the command writes, for the message.
-        marks: files that the command leaves; any one of them makes the folder its own. Hidden files do not count.
+        marks: files that the command leaves; any of them identifies the folder. Hidden files do not count.
     """
     refuse_kept(out)
     if _names(out) and not any((out / mark).is_file() for mark in marks):
@@ -53,7 +53,7 @@ def refuse_foreign(out: Path, what: str, *marks: str) -> None:
 
 
 def kept_in(folder: Path) -> str | None:
-    """What a folder keeps, by its files: "a run", "a policy", "an encoder", "an agent", "a data set", or None."""
+    """What a folder holds, by its files: "a run", "a policy", "an encoder", "an agent", "a data set", or None."""
     names = set(_names(folder))
     if {"card.json", "encoder", "policy"} <= names:
         return "an agent"
@@ -62,7 +62,7 @@ def kept_in(folder: Path) -> str | None:
             return "an encoder"
         if names & {"curve.csv", "snapshots"}:
             return "a policy"
-        # Other programs have a config.json, too: what has a stage is this package's.
+        # Other programs write a config.json too; only this package's has a stage.
         try:
             record = parse_json(read_bytes(folder / CONFIG_FILE))
         except UnavailableError:
@@ -76,7 +76,7 @@ def kept_in(folder: Path) -> str | None:
 
 
 def _names(folder: Path) -> list[str]:
-    """Names in a folder, without hidden ones; empty if it may not be listed, which writing there then reports."""
+    """Names in a folder except hidden ones; empty if it cannot be listed, since writing there will report the error."""
     try:
         return [name for name in os.listdir(folder) if not name.startswith(".")]
     except OSError as error:
@@ -87,10 +87,10 @@ def _names(folder: Path) -> list[str]:
 
 @contextmanager
 def owned(folder: Path) -> Iterator[None]:
-    """Own a folder, made if missing, and answer signals as `interrupt` says; the system frees what a killed one owned.
+    """Create and lock a folder, and handle signals as `interrupt` does. The lock of a killed process is released.
 
     Raises:
-        UserError: another process owns it, which the message names, or it cannot be written.
+        UserError: another process, which the message names, owns it, or it cannot be written.
     """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -109,14 +109,14 @@ def owned(folder: Path) -> Iterator[None]:
         with handled():
             yield
     finally:
-        # Deleted while it is still held, and never by anyone else: FileLock takes no lock on a name that is gone, so
-        # whoever waits makes a new file. After the release it could be another owner's already, and two would own it.
+        # Delete the lock file while holding the lock. FileLock does not lock a deleted file, so waiters create a new
+        # one. Deleted after the release, it could already be another owner's, and two processes would own the folder.
         (folder / LOCK).unlink(missing_ok=True)
         lock.release()
 
 
 def in_use(folder: Path) -> bool:
-    """Whether a process owns a folder, or seems to where this one may not look."""
+    """Whether another process owns a folder. True if permissions keep us from checking."""
     if not (folder / LOCK).exists():
         return False
     try:

@@ -1,4 +1,4 @@
-"""Live progress on the terminal: what runs, how far, how fast, how long still, and the newest numbers."""
+"""Progress on the terminal: what runs, how far, speed, ETA and the newest numbers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class ProgressLine:
-    """A progress bar on stderr; where that is no terminal, a plain line each tenth of the way and each half minute.
+    """A progress bar on stderr. If that is no terminal, a plain line per 10% of progress and per 30 s.
 
-    One without a title is not shown.
+    Nothing is shown without a title.
     """
 
     _PLAIN_LINES = 10
@@ -43,10 +43,10 @@ class ProgressLine:
         self._note = ""
         self._clock, self._first = clock, (start, clock())
         self._plain = self._first
-        """How far it was, and when, at the last plain line."""
+        """Progress and time at the last plain line."""
 
     def advance(self, amount: int = 1, **numbers: float) -> None:
-        """Move on by `amount`, showing `numbers` when given."""
+        """Advance by `amount`, and show `numbers` if given."""
         self._done += amount
         self._bar.advance(self._task, amount)
         if numbers:
@@ -65,7 +65,7 @@ class ProgressLine:
         if a_tenth_on or now - then >= self._PLAIN_S or self._done == self._total:
             self._plain = self._done, now
             parts = [f"{self._title}: {self._done}/{self._total} {self._unit}", self._note]
-            start, begun = self._first  # of this process: what one before it did took other seconds
+            start, begun = self._first  # this process only, not before a resume
             if now > begun and self._done > start:
                 speed = (self._done - start) / (now - begun)
                 left = timedelta(seconds=round(max(0, self._total - self._done) / speed))

@@ -1,4 +1,4 @@
-"""Where a number comes from: versions, git commit, command line and machine."""
+"""Where a result comes from: versions, git commit, command line and machine."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ PACKAGES = (
     "safetensors",
 )
 CONTINUED = "continued"
-"""Key in machine.json of the later parts of a run that went on with other hardware, commit or versions."""
+"""Key in machine.json for the later parts of a run that was resumed with other hardware, commit or versions."""
 COMMIT_FILE = "vd4rl_pomdp/commit.txt"
-"""Where a wheel keeps the commit it was built from, below the folder of its packages."""
+"""File in which a wheel stores the commit it was built from, relative to the installed packages."""
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of every package that can change a number."""
+    """Versions of Python and all packages that can affect results."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -43,9 +43,9 @@ def versions() -> dict[str, str]:
 
 
 def git_commit() -> str:
-    """Commit of this project that runs, with `+` for uncommitted changes: a checkout's own, else what `setup.py` wrote.
+    """Commit of the running code, with `+` for uncommitted changes: from the checkout, else as stored by `setup.py`.
 
-    Empty where neither tells. A repository that merely surrounds the installed package is another project's.
+    Empty if unknown. The commit of an unrelated repository around an installed package is ignored.
     """
     root = Path(__file__).resolve().parents[2]
     if commit := checkout_commit(root):
@@ -57,7 +57,7 @@ def git_commit() -> str:
 
 
 def checkout_commit(root: Path) -> str:
-    """Commit of a source tree, if it is the top of a git work tree of this project; else empty."""
+    """Commit of a source tree if it is the root of this project's git checkout; else empty."""
     try:
         project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"]
         if project != PACKAGES[0] or Path(_git(root, "rev-parse", "--show-toplevel")).resolve() != root:
@@ -73,7 +73,7 @@ def _git(root: Path, *words: str) -> str:
 
 
 def machine(device: str = "auto") -> dict[str, Any]:
-    """The hardware a run had on a device: processor, cores, memory and its GPU, if any, without host or user names."""
+    """Hardware of a run on a device: processor, cores, memory and GPU. No host or user names."""
     import torch
 
     from vd4rl_pomdp.runs.device import pick_device
@@ -93,15 +93,15 @@ def machine(device: str = "auto") -> dict[str, Any]:
 
 
 def command(stage: str = "", words: Sequence[str] | None = None) -> str:
-    """The command line, the program named as a user would type it.
+    """The command line, with the program's name as a user would type it.
 
     Args:
-        stage: the command of one run, where the command line names several.
-        words: that run's, behind the command; None: the command line's.
+        stage: command of the one run wanted, if the command line starts several.
+        words: that run's arguments; None: all of the command line's.
     """
     script = Path(sys.argv[0])
     program = [script.name]
-    if script.name in ("__main__.py", "-c"):  # python -m PACKAGE, and a worker's own command line
+    if script.name in ("__main__.py", "-c"):  # python -m PACKAGE, or a spawned worker
         program = ["vd4rl-pomdp", *([script.parent.name] if script.parent.name in ("pretrain", "finetune") else [])]
     given = sys.argv[1:] if words is None else [*(word for word in sys.argv[1:2] if word == stage), *words]
     return shlex.join([*program, *given])

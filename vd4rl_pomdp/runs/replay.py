@@ -1,8 +1,8 @@
-"""A training's step, captured once and replayed: on a GPU some hundred launches become one.
+"""Capture training steps as CUDA graphs and replay them: some hundred kernel launches become one.
 
-A step is a function without arguments but its turn. Whatever changes from step to step it reads from tensors that stay
-where they are: weights, optimiser state, counters, random numbers (`RandomStream`, `KeyStream`). A step that cannot be
-captured, because Python decides by a value or keeps a number of its own, is run as it is, and that is said once.
+A step is a function whose only argument is its turn. Everything else that changes between steps must be read from
+tensors that stay in place: weights, optimiser state, counters, random numbers (`RandomStream`, `KeyStream`). A step
+that cannot be captured, because Python branches on a value or keeps its own number, runs eagerly after one warning.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from vd4rl_pomdp.core.streams import RandomStream
 
 Logs = dict[str, Tensor]
 Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
-"""Takes a function without running it; gives what replays it, and the tensor that then holds its result."""
+"""Takes a function without running it; returns a function that replays it, and the tensor that then holds its
+result."""
 EAGER_VARIABLE = "VD4RL_POMDP_EAGER"
-"""Set to 1, no step is replayed."""
+"""If set to 1, no step is replayed."""
 WARM_UP = 3
-"""Steps of every turn that are run as they are: libraries choose their kernels, optimisers make their state."""
+"""Eager steps per turn before capture: libraries pick kernels and optimisers create their state."""
 
 
 class Replay:
-    """Calls a step; on a GPU replays it after the first few calls. Each call is one step of the training."""
+    """Runs training steps; on a GPU, replays them as CUDA graphs after the first few. Each call is one step."""
 
     def __init__(
         self,
@@ -44,12 +45,13 @@ class Replay:
         """See the class.
 
         Args:
-            step: does the step of a turn, 0 to period - 1, and returns scalars, or tensors of one a run.
-            device: where it does.
-            streams: all that it draws from.
-            period: steps after which Python does the same again, as with an actor that moves in every second step.
-            trained: what the step changes: whose Python numbers must stay as they are for it to be replayed.
-            capture: what captures; None: CUDA graphs on a GPU, nothing elsewhere.
+            step: does the step of a turn, 0 to period - 1. Returns scalars, or one-element-per-run tensors.
+            device: device of the step.
+            streams: all random streams that it uses.
+            period: steps after which the Python control flow repeats, e.g. 2 if every second step trains the
+                actor.
+            trained: objects that the step changes; replay requires that Python numbers in them stay constant.
+            capture: how to capture; None: CUDA graphs on a GPU, nothing elsewhere.
         """
         self._step, self._streams, self._period, self._trained = step, streams, period, trained
         self._side = torch.cuda.Stream(device) if device.type == "cuda" else None
@@ -58,15 +60,15 @@ class Replay:
         self._capture = capture
         self._eager = 0
         self._steps: dict[int, tuple[Callable[[], None], list[str], Tensor]] = {}
-        """By turn: what replays it, the names of its scalars and where they are."""
+        """By turn: its replay function, and the names and tensor of its scalars."""
 
     @property
     def replays(self) -> bool:
-        """Whether steps are replayed, now or after the first few."""
+        """Whether steps are replayed, now or after the warm-up."""
         return self._capture is not None
 
     def __call__(self, turn: int) -> Logs:
-        """Do the step of a turn; turns follow one another. The scalars are copies, of this step."""
+        """Do the step of a turn; turns must come in order. Returns copies of this step's scalars."""
         with self._on_side():
             if self._capture is None:
                 return self._step(turn)
@@ -88,7 +90,7 @@ class Replay:
         return logs
 
     def _ready(self, turn: int) -> bool:
-        """Whether the step can be replayed: every turn is captured when turn 0 comes after the warm-up."""
+        """Whether the step can be replayed. All turns are captured at the first turn 0 after the warm-up."""
         if turn != 0 or self._eager < WARM_UP * self._period:
             if turn == 0:
                 self._before = python_state(self._trained)
@@ -100,7 +102,7 @@ class Replay:
                 stream.in_blocks()
             for each in range(self._period):
                 self._steps[each] = self._captured(each)
-        except Exception as error:  # whatever it is, the step can be run as it is
+        except Exception as error:  # any failure: run eagerly instead
             self._give_up(first_line(error))
             return False
         return True
@@ -116,7 +118,7 @@ class Replay:
             for stream in self._streams:
                 stream.end()
             names.extend(logs)
-            # a number each, or, of stacked runs, one a run
+            # one number each, or one per run in a stack
             return torch.stack([value.detach().float().squeeze() for value in logs.values()])
 
         replay, values = self._capture(step)
@@ -131,7 +133,7 @@ class Replay:
 
     @contextmanager
     def _on_side(self) -> Iterator[None]:
-        """A stream of its own, as capturing wants it; what was begun before comes before, what follows after."""
+        """Run on a side stream, as capture requires, ordered after earlier and before later work."""
         if self._side is None:
             yield
             return
@@ -143,7 +145,7 @@ class Replay:
 
 
 class CudaCapture:
-    """Captures functions as CUDA graphs that share their memory, since they are replayed one after the other."""
+    """Captures functions as CUDA graphs in a shared memory pool, which is safe as they are replayed in sequence."""
 
     def __init__(self, stream: torch.cuda.Stream) -> None:
         self._stream, self._pool = stream, torch.cuda.graph_pool_handle()
@@ -151,17 +153,17 @@ class CudaCapture:
     def __call__(self, function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
         """See `Capture`."""
         graph = torch.cuda.CUDAGraph()
-        # thread_local: what other threads do with the GPU meanwhile is no part of it
+        # thread_local: ignore GPU work of other threads
         with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
             result = function()
         return graph.replay, result
 
 
 def python_state(objects: Sequence[Any]) -> dict[str, Any]:
-    """What Python holds in the attributes of objects, and of the modules and optimisers in them, by name.
+    """Values in the attributes of objects, and of modules and optimisers in them, by name.
 
-    Numbers and strings by value, tensors as they are: one that is put in another's place is a change, which a replayed
-    step would not see; one that is written to is none.
+    Numbers and strings by value, tensors by identity: replacing a tensor counts as a change, because a replayed
+    step would not see it; writing into one does not.
     """
     found: dict[str, Any] = {}
     seen: set[int] = set()
@@ -190,7 +192,7 @@ def python_state(objects: Sequence[Any]) -> dict[str, Any]:
 
 
 def changed_in(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """Name of an attribute that has changed, empty if none has."""
+    """Name of an attribute that changed, or ""."""
     for name in before.keys() | after.keys():
         one, other = before.get(name), after.get(name)
         same = one is other if isinstance(one, Tensor) or isinstance(other, Tensor) else one == other

@@ -1,12 +1,13 @@
-"""Results that outlive their run folders: one folder an experiment, small enough to commit.
+"""Results that outlive their run folders: one folder per experiment, small enough to commit.
 
-    runs.jsonl           one JSON object a run: its id, and what its small files hold, by their names
-    episodes.csv         raw evaluation rows, the run's id first
-    certificates.json    whether a set under a corruption needs a memory of what was seen, by ids that name the set's
-                         content and the corruption, as `vd4rl-pomdp certify` found; it lies in the set's folder, too
+    runs.jsonl           one JSON object per run: its id, and the contents of its small files by name
+    episodes.csv         raw evaluation rows; the first column is the run's id
+    certificates.json    whether a dataset under a corruption requires memory, as found by `vd4rl-pomdp certify`; keyed
+    by
+                         a hash of the dataset's content and the corruption, and also stored in the dataset's folder
 
-A report of a results folder is the same as one of the run folders, but for films. Both files are written whole, the
-rows first: rows of a run that runs.jsonl does not name were left by a cut writing, and are ignored.
+A report of a results folder equals one of the run folders, except for films. Both files are written whole, rows first.
+Rows of runs missing from runs.jsonl come from an interrupted write and are ignored.
 """
 
 from __future__ import annotations
@@ -35,39 +36,39 @@ from vd4rl_pomdp.runs.run import identity, recipe, remedy
 
 RUNS = "runs.jsonl"
 FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
-"""A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
+"""A run's small files: key in runs.jsonl, and path in the run folder."""
 
 CERTIFICATES = "certificates.json"
 NOT_CERTIFIED = "not certified"
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
 DAMAGED = "its files are damaged", "take another copy, or leave it out"
-"""What is said of a run whose files hold something else than a run writes."""
+"""Message for a run whose files do not hold what a run writes."""
 _ROUNDING = 1e-4
-"""Of a score, which is kept to four digits, as its return is."""
+"""Tolerance of a score; scores and returns are stored with four decimals."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """One run, finished or not, from its folder or from a results folder."""
+    """One run, finished or not, from its own folder or a results folder."""
 
     id: str
-    """Name of what it computes, see `runs.run.identity`."""
+    """Hash of what the run computes, see `runs.run.identity`."""
     path: Path
-    """Its folder, or the results folder that tells of it."""
+    """Its folder, or the results folder that lists it."""
     files: dict[str, dict[str, Any]]
-    """Content of the FILES that it has."""
+    """Contents of those FILES that it has."""
     step: int
-    """The last step of which its metrics tell, 0 before the first."""
+    """Last step in its metrics; 0 if there are none."""
     losses: list[tuple[int, float]]
-    """Step and action loss in the course of a pretraining."""
+    """Step and action loss over a pretraining."""
     rows: list[Row]
-    """Evaluation rows, one an episode."""
+    """Evaluation rows, one per episode."""
     folder: bool = False
     """Whether `path` is its own folder."""
 
     @property
     def place(self) -> str:
-        """Where it is told of, for a message."""
+        """Where it is stored, for messages."""
         return str(self.path) if self.folder else f"{self.path}: run {self.id}"
 
     @property
@@ -77,13 +78,13 @@ class Result:
 
     @property
     def parts(self) -> list[dict[str, Any]]:
-        """Hardware and `git_commit` of the run, and of each later part of it that had others."""
+        """Hardware and `git_commit` of the run, and of each later part that was resumed elsewhere."""
         told = self.files.get("machine", {})
         return [told | {"git_commit": self.record.get("git_commit")}, *told.get(CONTINUED, [])]
 
     @property
     def machine(self) -> str:
-        """What it was computed on: its GPU, or its processor and cores; "A then B" if it moved, empty if unknown."""
+        """Its GPU, or its processor and cores; "A then B" if it moved; empty if unknown."""
         told = []
         for part in self.parts:
             processor, cores = part.get("processor"), part.get("cores")
@@ -92,23 +93,24 @@ class Result:
 
     @property
     def commit(self) -> str:
-        """The commit it was computed with, likewise."""
+        """Commit that computed it; "A then B" as in `machine`."""
         return " then ".join(dict.fromkeys(str(one) for part in self.parts if (one := part.get("git_commit"))))
 
     @property
     def encoder(self) -> dict[str, Any]:
-        """What its encoder says of its pretraining; empty where there is none yet."""
+        """Its encoder's record of the pretraining; empty without an encoder."""
         return self.files.get("encoder", {}).get("pretrain", {})
 
     @property
     def origin(self) -> dict[str, Any]:
-        """What its encoder says of the code that made it, in earlier rows in a part of its own; empty without one."""
+        """Its encoder's record of the code that made it; earlier rows keep it in a separate part. Empty without an
+        encoder."""
         told = self.files.get("encoder", {})
         return told.get("origin", told)
 
     @property
     def card(self) -> dict[str, Any]:
-        """The same of the encoder that it started from; empty for a pretraining run."""
+        """Pretraining record of the encoder that it started from; empty for a pretraining run."""
         return self.encoder if self.record["stage"] == "finetune" else {}
 
     @property
@@ -118,52 +120,52 @@ class Result:
 
     @property
     def data(self) -> str:
-        """Fingerprint of its set, empty where it tells none."""
+        """Dataset fingerprint; empty if not recorded."""
         return self.record.get("inputs", {}).get("data", "")
 
     @cached_property
     def recipe(self) -> str:
-        """What it computes, but for its data's content."""
+        """Hash of what it computes, ignoring its data's content."""
         return recipe(self.record, self.card if {"settings", "seed"} <= self.card.keys() else {})
 
     @property
     def on_one_set(self) -> bool:
-        """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
+        """Whether its encoder, if any, was pretrained on the run's own dataset, as in every grid."""
         return self.card.get("data") in (None, self.data)
 
     @property
     def certificate(self) -> str:
-        """Id of the certificate that would speak of its set and corruption."""
+        """Id of the certificate for its dataset and corruption."""
         return certificate_id(self.data, self.encoder.get("corruption") or {})
 
     @property
     def measured(self) -> list[Row]:
-        """What it found: evaluation rows, or the measures of a navigation run."""
+        """Its results: evaluation rows, or the measures of a navigation run."""
         return self.rows or self.files.get("results", {}).get("rows", [])
 
     @property
     def finished(self) -> bool:
-        """Whether the run has come to its end."""
+        """Whether the run has finished."""
         return "timing" in self.files
 
     @property
     def diverged(self) -> dict[str, Any] | None:
-        """Where it diverged, as `step` and `message`; None if it did not."""
+        """`step` and `message` of its divergence; None if it did not diverge."""
         return self.files.get("diverged")
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to be done: it has finished, or it diverged."""
+        """Whether it has finished or diverged."""
         return self.finished or self.diverged is not None
 
     @property
     def ending(self) -> int:
-        """How much is told of its end: 0 that it has none yet, 1 that it diverged, 2 that it finished."""
+        """Rank of its end: 0 none yet, 1 diverged, 2 finished."""
         return self.settled + self.finished
 
 
 def read_records(folder: Path) -> Result:
-    """A run folder without metrics and rows: what its small files hold; raises UserError for a damaged one."""
+    """A run folder's small files, without metrics and rows; UserError for a damaged one."""
     files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
     if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
         raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
@@ -171,13 +173,13 @@ def read_records(folder: Path) -> Result:
 
 
 def read_run(folder: Path | str) -> Result:
-    """What a run folder holds; raises UserError for damaged files."""
+    """Everything in a run folder; UserError for damaged files."""
     folder = Path(folder)
     files = read_records(folder).files
     if "config" not in files:
         raise UserError(f"{folder}: is no run, which has a {CONFIG_FILE}; name a folder that a training wrote")
     metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
-    # A row that was cut with its run is left out; a finished run has none.
+    # a truncated last row is dropped only from unfinished runs
     found = read_episodes(path) if "timing" in files else episodes_until(path, sys.maxsize)
     rows = [{name: row[name] for name in COLUMNS} for row in found]
     step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
@@ -198,7 +200,7 @@ def read_run(folder: Path | str) -> Result:
 
 
 def _labels(run: Result) -> dict[str, Any]:
-    """A run's labels: from its rows, from its labels.json, or else as many as its config tells."""
+    """A run's labels: from its rows, its labels.json or else its config, as far as known."""
     known = run.rows[0] if run.rows else run.files.get("labels")
     if known is not None:
         if missing := [name for name in LABELS if name not in known]:
@@ -210,7 +212,7 @@ def _labels(run: Result) -> dict[str, Any]:
 
 
 def _id(run: Result) -> str:
-    """Its identity; of a policy whose encoder or data were not recorded whole, a hash of what is."""
+    """Its identity. If a policy's encoder or data are not fully recorded, a hash of what is."""
     data = run.record.get("inputs", {}).get("data")
     if data and ({"settings", "seed"} <= run.card.keys() or run.record["stage"] != "finetune"):
         return identity(run.record, run.card)
@@ -218,7 +220,7 @@ def _id(run: Result) -> str:
 
 
 def _check(run: Result) -> None:
-    """Look at the parts of a run that everything relies on; raises KeyError, TypeError or AttributeError."""
+    """Check the types of a run's essential parts; raises KeyError, TypeError or AttributeError."""
     if not all(isinstance(part, dict) for part in (*run.files.values(), *run.parts, run.record["config"], run.encoder)):
         raise TypeError("a part of it is no JSON object")
     if "seed" not in run.record["config"]:
@@ -231,10 +233,10 @@ def _check(run: Result) -> None:
 
 
 def read_results(folder: Path | str) -> list[Result]:
-    """All runs of a results folder; raises UserError if it is none, or damaged."""
+    """All runs of a results folder; UserError if it is none or damaged."""
     folder = Path(folder)
     path, by_run = folder / RUNS, dict[str, list[Row]]()
-    try:  # before the rows, which are written first: one that is written meanwhile lacks none
+    try:  # before the rows: they are written first, so a concurrent write cannot make rows look missing
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
         raise UserError(f"{path.parent}: holds no {RUNS}, so it is no results folder") from error
@@ -245,7 +247,7 @@ def read_results(folder: Path | str) -> list[Result]:
     for row in read_episodes(folder / EPISODES_FILE):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
-        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
+        # hundreds of thousands of rows repeat a few dozen strings: intern them
         shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
         by_run.setdefault(row["id"], []).append(shared)
     runs: dict[str, Result] = {}
@@ -261,14 +263,14 @@ def read_results(folder: Path | str) -> list[Result]:
                 raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; take another copy")
             files = {key: told[key] for key in FILES if key in told}
             losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
-            # those that it had when the line was written: a cut writing may have added later ones
+            # ignore rows that a later, interrupted write added
             runs[name] = Result(name, folder, files, int(told["step"]), losses, rows[:count])
             _check(runs[name])
     return list(runs.values())
 
 
 def write_results(out: Path, runs: Iterable[Result]) -> None:
-    """Write runs as a results folder that holds nothing else of the kind; a reader sees each file whole."""
+    """Write runs as a results folder, replacing its previous runs. Readers see each file whole."""
     runs = list(runs)
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -278,21 +280,22 @@ def write_results(out: Path, runs: Iterable[Result]) -> None:
                 files = {name: run.files[name] for name in FILES if name in run.files}
                 told = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
                 file.write(json.dumps(told | ({"losses": run.losses} if run.losses else {})) + "\n")
-        # Within: a disk that is full at either of them leaves both as they were.
+        # Inside the block: if the disk is full, both files stay unchanged.
         write_csv(out / EPISODES_FILE, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
 
 
 def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[Result]:
-    """Every run at or below some paths, each once: of a run folder, or else of a results folder.
+    """Every run at or below some paths, without duplicates, from run folders and results folders.
 
-    Results folders within a results folder are other experiments: they are read where they are named themselves.
+    Results folders nested in another one belong to other experiments and are read only if named themselves.
 
     Args:
-        paths: run folders, results folders, and folders that contain some.
-        but: a results folder that is not read unless it is named itself.
+        paths: run folders, results folders, or folders that contain them.
+        but: a results folder to skip unless it is in `paths`.
 
     Raises:
-        UserError: a path is missing, there is no run, two runs of one id have different rows, or a file is damaged.
+        UserError: a path is missing, there is no run, two runs with one id have different rows, or a file is
+            damaged.
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
@@ -318,24 +321,22 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
         other = found.setdefault(run.id, run)
         if other.settled and other.ending == run.ending and other.measured != run.measured:
             raise UserError(f"{run.path} and {other.path}: two runs of one method, setting and seed; name one of them")
-        # Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead.
+        # Of two copies of a run, prefer a finished, then a diverged one; then a run folder; then the one further along.
         found[run.id] = max(other, run, key=lambda one: (one.ending, one.folder, len(one.measured), one.step))
     return list(found.values())
 
 
 def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
-    """Append the runs at or below some paths to a results folder, each once; says what became of them.
+    """Append the runs at or below some paths to a results folder, and return a summary in words.
 
-    No row that is there changes.
-
-    An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled,
-    and one that diverged to the same run when it has finished after all.
+    Existing rows never change, except that an unfinished run is replaced by its finished or diverged version, and a
+    diverged one by its finished version.
 
     Raises:
-        UserError: as `find_results`, or `out` holds something else, is damaged or is in use.
+        UserError: as `find_results`, or `out` holds something else, is damaged or in use.
     """
     out = Path(out)
-    refuse_foreign(out, "results", RUNS, "README.md", "grid.toml")  # page and grid may be there before the first run
+    refuse_foreign(out, "results", RUNS, "README.md", "grid.toml")  # page and grid may exist before the first run
     found = find_results(paths, out)
     with owned(out):
         there = _kept(out)
@@ -356,16 +357,16 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
 
 
 def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
-    """Name of what a certificate is about: the set's fingerprint, and the settings of a corruption."""
+    """Id of a certificate: hash of the dataset's fingerprint and the corruption's settings."""
     return content_hash([data, dict(corruption)])
 
 
 def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
-    """All certificates at or below some folders, by id; of several for one id the newest.
+    """All certificates at or below some folders, by id; the newest of duplicates.
 
     Args:
         places: folders.
-        but: a folder whose own file is not read.
+        but: a folder whose own file is skipped.
 
     Raises:
         UserError: a file is damaged.
@@ -382,7 +383,7 @@ def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[s
 
 
 def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
-    """Add certificates to a folder's own; those of an id that is there take its place. None: nothing is written."""
+    """Add certificates to a folder's file, replacing those with the same id. Writes nothing if nothing changes."""
     file = folder / CERTIFICATES
     there = read_json(file) if file.exists() else {}
     if there | certificates != there:
@@ -390,17 +391,17 @@ def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
 
 
 def certificate_in_words(certificate: Row) -> str:
-    """The verdict and what it rests on."""
+    """The verdict and its reason."""
     return f"{certificate['verdict']} ({certificate['why']})"
 
 
 def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
-    """The certificates that speak of some runs, by id.
+    """Certificates that apply to some runs, by id.
 
     Args:
-        runs: of those whose own folders are named, the set's folder is looked into, too, where it is there.
-        places: folders at or below which they are looked for.
-        but: a folder whose own file is not read.
+        runs: runs read from their own folders also contribute their dataset's folder, if it exists.
+        places: folders to search, recursively.
+        but: a folder whose own file is skipped.
     """
     sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
     known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())], but)
@@ -408,15 +409,15 @@ def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | 
 
 
 def _kept(out: Path) -> dict[str, Result]:
-    """The runs of a results folder by id, none before the first."""
+    """The runs of a results folder by id; empty before the first one."""
     return {run.id: run for run in read_results(out)} if (out / RUNS).exists() else {}
 
 
 def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
-    """The runs of a results folder, and a sentence for each thing in them that their own records contradict.
+    """The runs of a results folder, and a sentence for each contradiction with their own records.
 
-    An id is computed anew from settings, seed, data and format as the row records them. Its episodes must be those that
-    its settings ask for, each once, under its labels; seeds and scores what numbers and returns make them.
+    Ids must match the recorded settings, seed, data and format. Episodes must be exactly those that the settings
+    ask for, with the run's labels; environment seeds must match episode numbers, and scores their returns.
 
     Raises:
         UserError: as `read_results`.
@@ -437,7 +438,7 @@ def _contradictions(run: Result) -> Iterator[str]:
             wrong = [(row[name], whose) for row, whose in told if value is not None and row[name] != value]
             if wrong:
                 yield f"{wrong[0][1]} the {name} {wrong[0][0]}, its record {value} ({len(wrong)} such)"
-        # steps: an earlier state of a longer training is an encoder, too
+        # not steps: an encoder may be an intermediate checkpoint of a longer training
         for name in sorted(trained.keys() & card.get("settings", {}).keys() - {"steps", "corruption"}):
             if trained[name] != card["settings"][name]:
                 yield f"its encoder says {name} {trained[name]}, its settings {card['settings'][name]}"
@@ -450,19 +451,19 @@ def _contradictions(run: Result) -> Iterator[str]:
 
 
 def _astray(run: Result) -> Iterator[str]:
-    """What is wrong with a run's episodes: which of them are there, and what each says of itself."""
+    """What is wrong with a run's episodes: missing or extra ones, and inconsistent values."""
     config, own = run.record["config"], run.labels["corruption"]
     played: dict[tuple[int, str], list[int]] = {}
     for row in run.rows:
         played.setdefault((row["step"], row["evaluated_under"]), []).append(row["episode"])
-    # at the end `evaluate --keep` adds episodes under others, as many as one likes
+    # `evaluate --keep` may add any number of episodes under other corruptions at the end
     wanted = {place: len(numbers) for place, numbers in played.items()}
-    if {"updates", "eval_every", "eval_episodes"} <= config.keys():  # which earlier runs do not tell
+    if {"updates", "eval_every", "eval_episodes"} <= config.keys():  # not recorded by earlier runs
         last, count, every = config["updates"], config["eval_episodes"], config["eval_every"]
         ended = {run.step, run.files["timing"].get("updates")} if run.finished else {last}
         if ended != {last}:
             yield f"it ends with update {(ended - {last}).pop()}, its record with {last}"
-        # one that has no end may have been cut in its newest evaluation
+        # an unfinished run may have been interrupted during its newest evaluation
         end = last if run.finished else (run.diverged or {"step": run.step})["step"] - 1
         wanted |= {
             (step, under): 0
@@ -479,7 +480,7 @@ def _astray(run: Result) -> Iterator[str]:
     task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})
     longest = min(config.get("eval_length", math.inf), task.decisions if task else math.inf)
     divisor = task.score_divisor if task else math.nan
-    known = reference.get("actor") is not None if "mean_reward" in reference else None  # earlier runs do not tell
+    known = reference.get("actor") is not None if "mean_reward" in reference else None  # earlier runs do not record it
     wrong = {
         "environment seeds are not those of their numbers": lambda row: (
             row["episode_seed"] - row["episode"] - EVALUATION_SEED
@@ -496,7 +497,7 @@ def _astray(run: Result) -> Iterator[str]:
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
-    """Raise UserError if writing runs as the results folder `out` would lose settled ones, or rows, that it holds."""
+    """Raise UserError if writing runs as the results folder `out` would lose finished or diverged runs, or rows."""
     there = [run for run in _kept(out).values() if run.settled]
     written = {run.id: run for run in runs if run.settled}
     if lost := [run for run in there if run.id not in written]:

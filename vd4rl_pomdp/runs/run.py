@@ -1,8 +1,9 @@
-"""A run is a folder: config.json first, then metrics.jsonl, checkpoints/ and results; the same command resumes it.
+"""A run is a folder: config.json, metrics.jsonl, checkpoints/ and results. The same command resumes it.
 
-Everything but `timing.json`, `machine.json` and the seconds in a checkpoint is the same whether a run was interrupted
-or not. One process owns the folder at a time. What it computes has a name, its `identity`: equal for equal settings,
-seed, data and format, whatever its folder and its machine. Its `recipe` can be told before its data exist.
+Everything except `timing.json`, `machine.json` and the seconds in checkpoints is identical whether or not a run was
+interrupted. One process at a time owns the folder. A run's `identity` is a hash of what it computes: equal for equal
+settings, seed, data and format, regardless of folder and machine. Its `recipe` omits the data's content, so it is known
+before the data exist.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def remedy(folder: Path) -> str:
-    """What to do about a result of a finished run that is lost or damaged."""
+    """Advice for a lost or damaged result of a finished run."""
     return (
         f"put it back, or remove {folder / TIMING_FILE} and re-run its command: it resumes from the last "
         "checkpoint and writes it anew"
@@ -36,28 +37,28 @@ def remedy(folder: Path) -> str:
 
 
 def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
-    """Name of what a run computes, 24 characters.
+    """Hash of what a run computes, 24 hex characters.
 
     Args:
         record: its config.json.
-        card: what the encoder it started from says of its pretraining; empty for a pretraining run.
+        card: pretraining record of its encoder; empty for a pretraining run.
     """
     inputs = record.get("inputs", {})
     named = record["config"].get("exogenous")
-    images = inputs.get("exogenous", named)  # the content of a folder; the name again of those that are made
+    images = inputs.get("exogenous", named)  # a folder's content hash; generated images keep their name
     own = [] if images == named else [images]
     return content_hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
 
 
 def recipe(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
-    """Name of what a run computes but for the content of its data, likewise."""
+    """Like `identity`, without the data's content."""
     own = settings_of(record["config"]) | {"seed": record["config"]["seed"]}
     before = {"settings": card["settings"], "seed": card["seed"]} if card else {}
     return content_hash([record.get("format", 1), record["stage"], own, before])
 
 
 class RunFolder:
-    """A run's files; `with` begins or resumes the run, owns its folder meanwhile, and answers signals."""
+    """A run's files. `with` starts or resumes the run, owns its folder meanwhile, and handles signals."""
 
     def __init__(
         self,
@@ -70,21 +71,21 @@ class RunFolder:
         collection: Mapping[str, Any] = _NOTHING,
         words: Sequence[str] | None = None,
     ) -> None:
-        """Nothing is written yet.
+        """Check the folder; writes nothing.
 
         Args:
             path: the folder.
             stage: the stage's name.
             config: the stage's settings, a dataclass.
-            inputs: hashes of what the run reads, by name: the data's fingerprint, the encoder's hash.
-            results: files that a finished run holds.
-            parts: names of parts that the inputs bring along, by the registries' `setting`: an encoder's corruption.
+            inputs: hashes of the run's inputs by name: the data's fingerprint, the encoder's hash.
+            results: files that a finished run must have.
+            parts: plug-ins that the inputs use, by the registries' `setting`, e.g. an encoder's corruption.
             collection: how the data were collected, for the record.
-            words: of its own command, where the command line names several runs.
+            words: the run's own command, if the command line starts several runs.
 
         Raises:
-            UserError: the folder holds something else, a run with other settings, inputs or of another format, or one
-                that was finished and has lost a result.
+            UserError: the folder holds something else, a run with other settings, inputs or format, or a
+                finished run that lost a result.
         """
         self.path = path
         self.config: dict[str, Any] = jsonable(flat(config))
@@ -132,7 +133,7 @@ class RunFolder:
         if not self.finished:
             self._stack.enter_context(owned(self.path))
             try:
-                self._check()  # another process may have begun or ended it since
+                self._check()  # another process may have started or finished it
                 self._begin()
             except BaseException:
                 self._stack.close()
@@ -141,11 +142,11 @@ class RunFolder:
 
     @property
     def _begins(self) -> bool:
-        """Whether nothing is there to resume from: what was recorded before tells of nothing."""
+        """Whether there is nothing to resume, so that earlier records can be overwritten."""
         return not (self.finished or self._checkpoints.steps() or (self.path / EPISODES_FILE).exists())
 
     def _begin(self) -> None:
-        """Write what the run begins with, or add to it where what it resumes with is something else."""
+        """Write the run's initial records, or append to them if it resumes with other hardware or code."""
         now = {"versions": versions(), "git_commit": git_commit()} | code_of(self._parts)
         hardware, path = machine(self.config.get("device", "auto")), self.path / MACHINE_FILE
         if self._begins:
@@ -157,7 +158,7 @@ class RunFolder:
         else:
             told, began = read_json(path), read_json(self.path / CONFIG_FILE)
             later = told.pop(CONTINUED, [])
-            code = {name: began.get(name, {}) for name in now}  # versions, commit, and where other parts come from
+            code = {name: began.get(name, {}) for name in now}  # versions, commit, and origin of plug-ins
             if (told | code | (later[-1] if later else {})) != hardware | now:
                 write_json(path, told | {CONTINUED: [*later, hardware | now]})
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
@@ -169,22 +170,22 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has come to its end."""
+        """Whether the run has finished."""
         return (self.path / TIMING_FILE).exists()
 
     @property
     def seconds(self) -> float:
-        """Wall-clock seconds of the run so far, those before its newest checkpoint included."""
+        """Wall-clock seconds of the run so far, including those before its newest checkpoint."""
         return self._before + time.monotonic() - self._started
 
     def restore(self, take: Callable[[State], None]) -> None:
-        """Hand the state of the newest whole checkpoint to `take`, if there is one.
+        """Pass the newest undamaged checkpoint's state to `take`, if there is one.
 
         Raises:
-            UserError: it does not fit the run, or evaluations are there, which follow a checkpoint, and none is.
+            UserError: it does not fit the run, or there are evaluations but no checkpoint.
         """
         seconds = self._checkpoints.restore(take)
-        # Without this the run would begin again and append the same evaluations a second time.
+        # The run would start over and append the same evaluations again.
         if seconds is None and read_episodes(self.path / EPISODES_FILE):
             raise UserError(
                 f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: put them back, "
@@ -193,14 +194,14 @@ class RunFolder:
         self._before = seconds or 0.0
 
     def save(self, step: int, state: State) -> None:
-        """Keep the state after a step as the newest checkpoint."""
+        """Save the state after a step as the newest checkpoint."""
         self._checkpoints.add(step, state, self.seconds)
 
     def mark_diverged(self, step: int, message: str) -> None:
-        """Say that a number was no longer finite after `step`; resuming the run takes the mark away."""
+        """Record that a number became non-finite after `step`. Resuming the run removes the mark."""
         write_json(self.path / DIVERGED_FILE, {"step": step, "message": message})
 
     def finish(self, **more: Any) -> None:
-        """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
-        self._checkpoints.prune(1)  # one stays: a result that is lost later is computed again from the end
+        """Mark the run as finished; keeps its wall-clock seconds and the last checkpoint."""
+        self._checkpoints.prune(1)  # keep one: a result that gets lost can be recomputed from the end
         write_json(self.path / TIMING_FILE, {"seconds": round(self.seconds, 2)} | more)

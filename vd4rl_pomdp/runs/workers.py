@@ -1,4 +1,4 @@
-"""Independent jobs over worker processes: the standard library's pool, whose workers end at once with their caller."""
+"""Parallel jobs in worker processes: the standard library's pool, but workers die at once with their parent."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ Result = TypeVar("Result")
 
 
 class _Pool:
-    """Worker processes that have started."""
+    """Running worker processes."""
 
     def __init__(self, workers: int) -> None:
         self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
         self._processes: dict[int, Any] = {}
 
     def map(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
-        # Processes that are started here inherit the mask: Ctrl-C, which a terminal sends to all, is not for them, nor
-        # is the SIGTERM that a cluster sends to a whole group.
+        # Workers inherit the signal mask, which spares them Ctrl-C from a terminal and SIGTERM to a process group.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             results = self._executor.map(function, jobs)
@@ -41,27 +40,27 @@ class _Pool:
         return results
 
     def serves(self, workers: int) -> bool:
-        """Whether so many are there and alive."""
-        # by their sentinels: `is_alive` says yes to a process that another thread has waited for
+        """Whether at least `workers` processes are there and all are alive."""
+        # via sentinels: `is_alive` returns True if another thread has waited for the process
         ended = multiprocessing.connection.wait([process.sentinel for process in self._processes.values()], 0)
         return len(self._processes) >= workers and not ended
 
     def close(self) -> None:
-        for process in self._processes.values():  # they hold nothing that could be lost, and `shutdown` waits for jobs
+        for process in self._processes.values():  # they hold no state, and `shutdown` would wait for their jobs
             process.kill()
         self._executor.shutdown(cancel_futures=True)
 
 
 _kept: list[_Pool] = []
-"""Idle workers, of one pool at most."""
+"""Idle workers of at most one pool."""
 _keeping = False
 
 
 @contextmanager
 def kept_workers() -> Iterator[None]:
-    """Within the block, workers that have done their jobs wait for those of the next `run_jobs`.
+    """Within the block, workers stay alive between calls of `run_jobs`.
 
-    They need not start again, nor open what they opened: for evaluations of a training, which follow one another.
+    This saves start-up time and keeps their open environments, e.g. for the successive evaluations of a training.
     """
     global _keeping
     before, _keeping = _keeping, True
@@ -81,18 +80,18 @@ def _close_kept() -> None:
 def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     """Yield function(job) for every job, in order.
 
-    Workers are fresh processes (no GL context or thread pool is inherited) with one thread each; under `kept_workers`
-    they may have served before. With one worker everything runs in the calling process; 0 is a worker for every core.
+    Workers are fresh single-threaded processes that inherit no GL context or thread pool; under `kept_workers` they
+    may be reused. With one worker, everything runs in the calling process. 0 means one worker per core.
 
     Raises:
-        UserError: a worker died, or a job cannot be sent to one; what a job raises is raised here.
+        UserError: a worker died, or a job cannot be pickled. Exceptions of jobs are re-raised here.
     """
     workers = min(count_workers(workers), len(jobs))
     if workers <= 1:
         yield from map(function, jobs)
         return
     try:
-        ForkingPickler.dumps(jobs[0])  # the pool tells of it only by a job's error, which looks like the job's own
+        ForkingPickler.dumps(jobs[0])  # check here: from the pool, a pickling error looks like the job's own error
     except (PicklingError, AttributeError, TypeError) as error:
         raise UserError(
             f"a job cannot be sent to a worker process ({first_line(error)}): define its classes and functions in a "
@@ -105,7 +104,7 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
         yield from pool.map(function, jobs)
         done = True
     except BrokenProcessPool as error:
-        if error.__cause__ is not None:  # a result that cannot be read here
+        if error.__cause__ is not None:  # a result that cannot be unpickled here
             raise
         raise WorkerDiedError(
             "a worker process ended before its job: if it printed nothing, it was killed, perhaps for want of memory: "
@@ -119,19 +118,19 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
 
 
 def count_workers(workers: int) -> int:
-    """`workers`, or for 0 the number of cores that this process may use."""
+    """`workers`, or the number of usable cores if 0."""
     if workers:
         return workers
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _start_worker() -> None:
-    """One thread a worker, which never outlives its parent, however that ends."""
+    """Set up a worker: one thread, and exit with the parent however that ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     import threadpoolctl
     import torch
 
-    # Each library would start a thread for every core in every worker, and they would wait for one another.
+    # Otherwise every library starts one thread per core in each worker.
     torch.set_num_threads(1)
     threadpoolctl.threadpool_limits(1)
 
@@ -140,4 +139,4 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     multiprocessing.connection.wait([parent.sentinel])
-    os._exit(1)  # at once, even inside a library's C code: nobody is left to take what it computes
+    os._exit(1)  # immediately, even inside a library's C code: the result has no recipient

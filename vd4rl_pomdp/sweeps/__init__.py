@@ -1,1 +1,1 @@
-"""Sweeps: grids of runs, carried out by an executor, and gone on with wherever they were cut."""
+"""Sweeps: grids of runs, started by an executor and resumed after any interruption."""

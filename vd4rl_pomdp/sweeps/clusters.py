@@ -1,7 +1,7 @@
-"""A sweep on a cluster: tasks that each are a driver of their own, on its machine, in the sweep's one folder.
+"""Sweeps on a cluster: every task is a full driver that works on the sweep's shared folder.
 
-The driver in front only counts: as long as there are jobs that could run, it keeps as many tasks in the queue as they
-need. Which task takes which job is settled where it is for any two drivers: a run folder has one owner.
+The driver in front only counts: while jobs can run, it keeps enough tasks in the queue. Tasks need no other
+coordination than any drivers that share a folder: a run folder has one owner at a time.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, l
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
 LOOK_S = 15.0
-"""Seconds between two looks at the cluster."""
+"""Seconds between polls of the cluster."""
 ANSWER_S = 30.0
-"""Seconds that a cluster has to answer."""
+"""Timeout of a command to the cluster, seconds."""
 VAIN = 3
-"""Times that tasks may be asked for again without anything having happened."""
+"""Resubmissions without any progress before the sweep gives up."""
 
 
 @dataclass(frozen=True)
@@ -43,32 +43,32 @@ class ClusterTask:
     """Name of the plan; empty: all plans in the folder."""
     options: LocalOptions
     cwd: str
-    """In which relative paths begin."""
+    """Working directory, to which relative paths refer."""
 
     def __call__(self) -> None:
-        """Take jobs that nobody has until none is left; SIGTERM and SIGUSR2, Slurm's warning, end it in peace."""
+        """Run unclaimed jobs until none is left. SIGTERM and SIGUSR2 (Slurm's warning) end it gracefully."""
         try:
             os.chdir(self.cwd)
         except OSError as error:
             raise UserError(f"{self.cwd}: not on node {socket.gethostname()}; use a disk that all share") from error
         with interrupt.handled():
-            # submitit's own answer to it would be to submit the task again, which is for `watch` to decide.
+            # submitit would resubmit the task on SIGUSR2; here `watch` decides that.
             signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
             folder = SweepFolder(self.out)
             Driver(folder.plans_to_do(self.plan), self.options, folder, helps=True).run()
 
 
 def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFolder, name: str) -> bool:
-    """Keep a sweep's tasks on a cluster until nothing is left that can be done; whether all is finished.
+    """Keep a sweep's tasks on the cluster until no job can run any more. Return whether all jobs are finished.
 
     Args:
-        plans: of which the jobs are carried out.
-        cluster: where; tasks see the folders of runs and sets at the same paths.
-        folder: the sweep's.
-        name: of its plan; empty: all plans in its folder.
+        plans: their jobs are run.
+        cluster: where to run; its nodes see run and dataset folders at the same paths.
+        folder: the sweep's folder.
+        name: plan name; empty: all plans in the folder.
 
     Raises:
-        UserError: the cluster refuses the first tasks, or tasks end and nothing happens.
+        UserError: the cluster rejects the first tasks, or tasks keep ending without progress.
     """
     jobs = jobs_of(plans)
     task = ClusterTask(folder.out, name, cluster.local, os.getcwd())
@@ -93,14 +93,14 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                 processes = len(in_stacks(could, cluster.local.stack, attempts))
                 wanted = min(cluster.tasks, -(-processes // cluster.local.jobs)) - live
                 if wanted > 0:
-                    vain += not live  # tasks that wait in the queue, perhaps for days, are not in vain
+                    vain += not live  # queued tasks may wait for days: no failure
                     if vain > VAIN:
                         raise UserError(f"tasks end before they begin a job: see {cluster.folder}")
-                    with interrupt.deferred():  # what is half asked for could not be taken back
+                    with interrupt.deferred():  # an interrupted submission could not be cancelled
                         cluster.submit(task, wanted)
                 heard = True
             except UnavailableError as error:
-                if not heard:  # what a cluster refuses at first ends the sweep, later it is asked again
+                if not heard:  # fail on the first contact; later, keep trying
                     raise
                 print(f"warning: {error}; trying again", file=sys.stderr, flush=True)
             until = time.monotonic() + LOOK_S
@@ -113,14 +113,15 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
 
 
 class SlurmCluster:
-    """A sweep's tasks as arrays of Slurm, submitted by submitit; its queue knows them by a name of the folder's."""
+    """A sweep's tasks as Slurm job arrays, submitted by submitit and found in the queue by a name hashed from the
+    folder."""
 
     def __init__(self, options: SlurmOptions, folder: Path) -> None:
-        """Asks Slurm for nothing yet; UserError if submitit or Slurm's commands are missing.
+        """Check that submitit and Slurm's commands are installed, or raise UserError. Slurm is not contacted yet.
 
         Args:
-            options: what a task gets.
-            folder: for what submitit and the tasks write, on a disk that all nodes share.
+            options: resources of a task.
+            folder: where submitit and the tasks write, on a disk shared by all nodes.
         """
         try:
             import submitit
@@ -138,22 +139,22 @@ class SlurmCluster:
         self._executor.update_parameters(name=self._name, stderr_to_stdout=True, **parameters(options))
 
     def live(self) -> int:
-        """How many tasks of this sweep wait or run; UnavailableError if Slurm does not answer."""
+        """Number of this sweep's tasks in the queue or running; UnavailableError if Slurm does not answer."""
         return len(self._ask("squeue", "--array", "--noheader", "--format=%T").split())
 
     def submit(self, task: ClusterTask, number: int) -> None:
-        """Submit one array; UserError if Slurm does not take it."""
+        """Submit one array; UserError if Slurm rejects it."""
         try:
             with disk_errors(self.folder):
                 self._executor.submit_array([task] * number)
-        except RuntimeError as error:  # submitit's for a command that failed
+        except RuntimeError as error:  # how submitit reports a failed command
             lines = str(error).strip().splitlines()
             raise UserError(f"Slurm took no array ({lines[-1] if lines else 'it does not say why'})") from error
 
     def stop(self) -> None:
-        """Take what waits out of the queue, ask every task to end where nothing is lost, and wait for it."""
+        """Cancel pending tasks, signal the running ones to checkpoint and exit, and wait for them."""
         try:
-            # Those that wait first: they would begin in the room of those that end.
+            # Pending tasks first, or they would start as the running ones end.
             self._ask("scancel", "--quiet", "--state=PENDING")
             self._ask("scancel", "--quiet", "--signal=USR2")
             until = time.monotonic() + PATIENCE_S + 15
@@ -164,19 +165,20 @@ class SlurmCluster:
             print(f"warning: {error}; tasks may be left: scancel --me --name={self._name}", file=sys.stderr)
 
     def _ask(self, command: str, *words: str) -> str:
-        """What a command of Slurm's prints of this sweep's tasks; UnavailableError if it does not answer."""
+        """Run a Slurm command on this sweep's tasks and return its stdout; UnavailableError if it fails or times
+        out."""
         told = [command, "--me", f"--name={self._name}", *words]
         try:
             answer = subprocess.run(told, capture_output=True, text=True, check=False, timeout=ANSWER_S)
         except subprocess.TimeoutExpired as error:
             raise UnavailableError(f"Slurm does not answer: {command} has not ended after {ANSWER_S:g} s") from error
-        if answer.returncode and command == "squeue":  # scancel fails where there is nothing to cancel
+        if answer.returncode and command == "squeue":  # scancel also fails when there is nothing to cancel
             raise UnavailableError(f"Slurm does not answer: see what squeue says ({answer.stderr.strip()})")
         return answer.stdout
 
 
 def parameters(options: SlurmOptions) -> dict[str, Any]:
-    """What submitit is told of a task."""
+    """Task options as submitit's `slurm_*` parameters."""
     names = ("partition", "account", "qos", "constraint", "time")
     found = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.gpus:
@@ -186,7 +188,7 @@ def parameters(options: SlurmOptions) -> dict[str, Any]:
     further = [parameter.removeprefix("--").partition("=") for parameter in options.sbatch]
     found |= {
         "cpus_per_task": options.cpus,
-        "srun_args": [f"--cpus-per-task={options.cpus}"],  # which some versions do not take from sbatch
+        "srun_args": [f"--cpus-per-task={options.cpus}"],  # some Slurm versions do not inherit it from sbatch
         "array_parallelism": options.tasks,
         "signal_delay_s": round(PATIENCE_S + 15),
         "additional_parameters": {"requeue": True} | {name: value or True for name, _, value in further},
@@ -195,13 +197,13 @@ def parameters(options: SlurmOptions) -> dict[str, Any]:
 
 
 class RayCluster:
-    """A sweep's tasks on a Ray cluster that is there already, each with one job at a time.
+    """A sweep's tasks on an existing Ray cluster, one job at a time each.
 
-    Ray chooses nodes and GPUs, and ends a task with the driver that asked for it. It tries nothing again itself.
+    Ray picks nodes and GPUs, and kills a task when the driver that submitted it dies. Ray's own retries are off.
     """
 
     def __init__(self, options: RayOptions, folder: Path) -> None:
-        """Connect to the cluster; UserError if Ray is missing, no cluster answers, or no node has room for a job."""
+        """Connect to the cluster; UserError if Ray is missing, no cluster answers, or no node fits a job."""
         try:
             import ray
         except ImportError as error:
@@ -209,13 +211,13 @@ class RayCluster:
         self._ray, self._options, self.folder = ray, options, folder
         self.local = LocalOptions(jobs=1, threads=max(1, int(options.cpus)), stack=options.stack)
         self._running: list[Any] = []
-        before = signal.getsignal(signal.SIGTERM)  # which Ray would answer in its own way
+        before = signal.getsignal(signal.SIGTERM)  # ray.init replaces this handler
         try:
             host, colon, port = options.address.rpartition(":")
-            if colon and port.isdecimal():  # `ray.init` would try for ten minutes, and answer no signal
+            if colon and port.isdecimal():  # fail fast: `ray.init` retries for ten minutes and ignores signals
                 socket.create_connection((host, int(port)), ANSWER_S).close()
             ray.init(options.address, log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)
-        except (OSError, RuntimeError, ValueError) as error:  # a RuntimeError for a cluster of another version
+        except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: the cluster runs another Ray version
             raise UserError(
                 f"no Ray cluster at --address {options.address} ({first_line(error)}): start one with `ray start "
                 "--head`, or name another"
@@ -231,14 +233,14 @@ class RayCluster:
 
     @property
     def tasks(self) -> int:
-        """What was asked for, or what the nodes take that are there now."""
+        """Number of concurrent tasks: `--jobs`, or as many as the current nodes fit."""
         wanted = {"CPU": self._options.cpus, "GPU": self._options.gpus}
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         rooms = (min(int(one.get(name, 0) / share) for name, share in wanted.items() if share) for one in nodes)
         return self._options.jobs or sum(rooms)
 
     def live(self) -> int:
-        """How many tasks wait or run. One that failed says why."""
+        """Number of tasks waiting or running. Prints why a task failed."""
         over: list[Any] = []
         if self._running:
             over, self._running = self._ray.wait(self._running, num_returns=len(self._running), timeout=0)
@@ -251,13 +253,13 @@ class RayCluster:
         return len(self._running)
 
     def submit(self, task: ClusterTask, number: int) -> None:
-        """Start tasks; Ray finds their nodes."""
-        run = self._ray.remote(max_retries=0)(lambda: task())  # the sweep's own rows decide what is tried again
+        """Submit tasks; Ray places them on nodes."""
+        run = self._ray.remote(max_retries=0)(lambda: task())  # retries are decided from the sweep's attempt log
         run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
         self._running += [run.remote() for _ in range(number)]
 
     def stop(self) -> None:
-        """Cancel what waits, ask every task to end where nothing is lost, and wait for it."""
+        """Cancel pending tasks, ask the running ones to checkpoint and exit, and wait for them."""
         for task in self._running:
             self._ray.cancel(task)
         if self._running:

@@ -1,8 +1,8 @@
-"""Carries out plans on this machine: starts what can be started, retries what can pass, and lets the rest go on.
+"""Runs a sweep's plans on this machine: starts jobs, retries transient failures, and keeps going when a job fails.
 
-Whether a job is done, its folder says; so a driver may be killed at any moment, several may work on one folder, and the
-next one goes on with whatever is left. One process may do several fine-tunings, as `vd4rl-pomdp finetune WORDS + WORDS`
-does: each stays a job of its own, with its own folder, command, attempts and end.
+Whether a job is done is read from its own folder. So a driver can be killed at any time, several can share one sweep
+folder, and a new one resumes the rest. One process can train several policies as a stack (`vd4rl-pomdp finetune WORDS +
+WORDS`); each remains a separate job with its own folder, command, attempts and result.
 """
 
 from __future__ import annotations
@@ -42,48 +42,48 @@ from vd4rl_pomdp.sweeps.plan import Job
 
 POLL_S = 0.5
 PAUSE_S = 60.0
-"""Before another attempt, whoever made the last."""
+"""Seconds to wait before a retry, whichever driver made the last attempt."""
 IN_USE_S = 10.0
-"""Until a job that another driver has is looked at again."""
+"""Seconds before checking again on a job that another driver is running."""
 IDLE_S = 90.0
-"""A helping driver that finds nothing to start for so long ends."""
+"""Seconds after which a helping driver with nothing to start exits."""
 PATIENCE_S = 120.0
-"""Seconds that a job has to end in after SIGTERM: it finishes a step and writes a checkpoint."""
+"""Seconds between SIGTERM and SIGKILL, in which a job finishes its step and writes a checkpoint."""
 _ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Room for one job."""
+    """Cores and GPU of one job."""
 
     cores: tuple[int, ...]
     gpu: str | None
-    """What CUDA_VISIBLE_DEVICES is to be."""
+    """Value for CUDA_VISIBLE_DEVICES."""
 
 
 @dataclass(frozen=True)
 class _Running:
     jobs: list[Job]
-    """Several: a stack."""
+    """More than one: a stack."""
     places: list[Place]
     process: subprocess.Popen
     began: float
     log: Path
     log_size: int
-    """Bytes of the log before this attempt."""
+    """Size of the log in bytes before this attempt."""
 
 
 class Driver:
-    """One process's part in a sweep."""
+    """One process that works on a sweep, possibly alongside others."""
 
     def __init__(self, plans: Iterable[Plan], options: LocalOptions, folder: SweepFolder, helps: bool = False) -> None:
         """See the module.
 
         Args:
-            plans: of which the jobs are carried out, each after those it needs.
-            options: what this machine takes.
-            folder: the sweep's.
-            helps: whether it is one of several, which ends when there is nothing to start for IDLE_S.
+            plans: their jobs are run, each after the jobs it needs.
+            options: how many jobs this machine runs, and on what.
+            folder: the sweep's folder.
+            helps: whether this driver is one of several, and exits after IDLE_S without work.
         """
         self._plans = {job.name: plan for plan in plans for job in plan.jobs}
         self._jobs = {job.name: job for job in jobs_of(plans)}
@@ -92,21 +92,21 @@ class Driver:
         self._folder, self._helps = folder, helps
         self._running: list[_Running] = []
         self._not_before: dict[str, float] = {}
-        """When to look again at what others have, or what has just failed."""
+        """Earliest time to look at a job again that another driver runs or that just failed."""
         self._busy = time.monotonic()
-        """When something last ran."""
+        """Time at which something last ran."""
         self._widths: dict[str, int | None] = {}
-        """Of what fine-tunings are given, once their encoders are there."""
+        """Feature width by fine-tuning job, known once its encoder exists."""
 
     def run(self) -> bool:
-        """Work until nothing is left that can be done; whether all is finished."""
+        """Run jobs until none can run any more. Return whether all are finished."""
         try:
             while self._look():
                 time.sleep(POLL_S)
                 self._collect()
                 interrupt.check("the sweep's jobs have ended")
         except BaseException:
-            # Every job is asked to end where nothing is lost; all at once, so that they share the patience.
+            # Terminate all jobs at once, so that they share the grace period for their checkpoints.
             for one in self._running:
                 one.process.terminate()
             until = time.monotonic() + PATIENCE_S
@@ -118,11 +118,11 @@ class Driver:
                     one.process.wait()
             self._collect()
             raise
-        return all(map(is_finished, self._left.values()))  # others may have finished what was given up here
+        return all(map(is_finished, self._left.values()))  # other drivers may have finished jobs that failed here
 
     def _look(self) -> bool:
-        """Start every job that can be; whether there is anything left to wait for."""
-        attempts = self._folder.attempts(self._jobs.values())  # other drivers', too
+        """Start all jobs that can start. Return whether there is anything left to wait for."""
+        attempts = self._folder.attempts(self._jobs.values())  # includes other drivers' attempts
         lost = lost_among(self._left.values(), attempts)
         running = {job.name for one in self._running for job in one.jobs}
         ready = []
@@ -134,7 +134,7 @@ class Driver:
                 ready.append(job)
         processes = self._in_processes(ready, attempts, lost, running) if self._free else []
         for number, jobs in enumerate(processes, 1):
-            # Asked now: starting the ones before took time in which another driver may have begun these.
+            # Checked only now: while we started the previous ones, another driver may have begun these.
             if self._free and (mine := [job for job in jobs if not self._is_anothers(job)]):
                 self._begin(mine, spare=len(self._free) - 1 - len(processes[number:]))
         if self._running:
@@ -145,7 +145,7 @@ class Driver:
     def _in_processes(
         self, ready: list[Job], attempts: Mapping[str, list[Row]], lost: set[str], running: set[str]
     ) -> list[list[Job]]:
-        """Ready jobs by process, in the order to start them in; a stack that is about to grow is left out."""
+        """Ready jobs grouped by process, in starting order. A stack that will soon grow is held back."""
 
         def alike(job: Job) -> Hashable:
             if self._stack == 1 or not (kind := kind_of(job)):
@@ -158,17 +158,18 @@ class Driver:
         def small(jobs: list[Job]) -> bool:
             return bool(len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name]))
 
-        # Only for what comes when a job that runs or starts here ends: else a place would be idle too long.
+        # Hold back only for jobs that become ready as soon as a running or starting job ends, or a slot would idle too
+        # long.
         coming = running | {job.name for job in ready}
         waiting = [(job, self._left.keys() & job.needs) for job in self._left.values() if job.name not in lost]
         soon = {kind_of(job) for job, needs in waiting if needs and needs <= coming}
         found = in_stacks(ready, self._stack, attempts, alike)
         if self._helps:
-            random.shuffle(found)  # or all drivers would start the same one
+            random.shuffle(found)  # or all drivers would race for the same job
         return sorted((jobs for jobs in found if not (small(jobs) and kind_of(jobs[0]) in soon)), key=small)
 
     def _is_anothers(self, job: Job) -> bool:
-        """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
+        """Whether another driver runs or has finished this job. In this order of checks, it cannot end in between."""
         if in_use(job.folder):
             self._not_before[job.name] = time.monotonic() + IN_USE_S
         elif is_finished(job):
@@ -181,7 +182,7 @@ class Driver:
         return self._folder.path / "logs" / f"{job.name}.log"
 
     def _begin(self, jobs: list[Job], spare: int) -> None:
-        """Start a process; a stack has up to a place for each job, which it evaluates on, as far as some are spare."""
+        """Start a process for some jobs. A stack takes one place per job, if spare, for its parallel evaluations."""
         log, gpu = self._log(jobs[0]), self._free[0].gpu
         taken = [place for place in self._free if place.gpu == gpu][: max(1, min(len(jobs), 1 + spare))]
         place = Place(tuple(sorted({core for one in taken for core in one.cores})), gpu)
@@ -204,7 +205,7 @@ class Driver:
         for one in [one for one in self._running if one.process.poll() is not None]:
             self._running.remove(one)
             self._free += one.places
-            code = one.process.returncode  # negative for a signal
+            code = one.process.returncode  # negative: killed by a signal
             if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
                 cause = INTERRUPTED
             else:
@@ -213,12 +214,12 @@ class Driver:
             self._end(one.jobs, cause, time.monotonic() - one.began, line)
 
     def _end(self, jobs: list[Job], cause: str, seconds: float, line: str) -> None:
-        """Keep the rows of an attempt, and tell them."""
+        """Record and print the result of an attempt."""
         told: Row = {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "host": socket.gethostname()}
         told |= {"log": str(self._log(jobs[0]).relative_to(self._folder.out))}
         told |= {"stack": len(jobs)} if len(jobs) > 1 else {}
         unfinished = [job for job in jobs if not is_finished(job)]
-        if cause == FAILED and any(in_use(job.folder) for job in unfinished):  # another driver was faster: no attempt
+        if cause == FAILED and any(in_use(job.folder) for job in unfinished):  # lost a race: no attempt
             self._not_before |= {job.name: time.monotonic() + IN_USE_S for job in unfinished}
             jobs = [job for job in jobs if job not in unfinished]
         for job in jobs:
@@ -240,25 +241,25 @@ class Driver:
 
 
 def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:
-    """Start a job's process, which is the command that one would type, in the plan's working directory.
+    """Start a job's process in the plan's working directory, as the command a user would type.
 
     Args:
-        words: the command, after `vd4rl-pomdp`.
-        plan: the job's.
-        log: what it prints is appended to this file.
+        words: the command's words after `vd4rl-pomdp`.
+        plan: the job's plan.
+        log: file to which its output is appended.
         place: the cores and the GPU that it may use.
-        threads: its CPU threads; 0: one a core.
+        threads: its CPU threads; 0: one per core.
     """
-    # A command line in a process of its own: anyone can repeat it by hand, a crash or a lack of memory ends it alone,
-    # and cores, GPU and signals are the system's business. Of how it ended the exit code is all that is seen.
+    # One command line per process: anyone can repeat it by hand, a crash or OOM kill takes down nothing else, and the
+    # system manages cores, GPU and signals. The exit code is all that the driver learns.
     imports = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     told = {JOB_VARIABLE: "1", "PYTHONPATH": imports, "OMP_NUM_THREADS": str(threads or max(1, len(place.cores)))}
     if place.gpu is not None:
         told["CUDA_VISIBLE_DEVICES"] = place.gpu
-    program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: not what the working directory calls so
+    program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: do not import from the working directory
     mine = os.sched_getaffinity(0) if place.cores else set()
-    # What a thread may use, and the signals that it blocks, a process has from the one that starts it. Slurm sends its
-    # warning before a time limit to every process; a task answers it, and asks its jobs to end.
+    # A child inherits affinity and blocked signals. Slurm sends its time-limit warning to every process; only the task
+    # itself should react, and then terminate its jobs.
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2})
     try:
         if place.cores:
@@ -271,7 +272,7 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=file,
-                start_new_session=True,  # Ctrl-C is the driver's business
+                start_new_session=True,  # the driver handles Ctrl-C
             )
     finally:
         if place.cores:
@@ -280,7 +281,7 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
 
 
 def _line_of_end(log: Path, start: int) -> str:
-    """Why a job ended, in a log behind so many bytes of it: its last line, or that of an exception with a traceback."""
+    """Why a job ended, from its log after byte `start`: the last line, or the exception line of a traceback."""
     try:
         text = log.read_bytes()[start:].decode(errors="replace")
     except OSError:
@@ -290,17 +291,17 @@ def _line_of_end(log: Path, start: int) -> str:
     _, traceback, rest = "\n".join(lines).rpartition("Traceback (most recent call last):\n")
     if not traceback or last.startswith("error: "):
         return last
-    return next((line for line in rest.splitlines() if not line[0].isspace()), last)  # its message may have more lines
+    return next((line for line in rest.splitlines() if not line[0].isspace()), last)  # the message may have more lines
 
 
 def say(row: Row, done: int, of: int) -> None:
-    """Print how an attempt at a job ended."""
+    """Print the result of an attempt."""
     line = f"[{done}/{of}] {row['cause']:<11} {row['seconds']:6.0f} s  {row['job']}"
     print(line + (f": {row['line']}" if row["line"] else ""), file=sys.stderr, flush=True)
 
 
 def places(options: LocalOptions) -> list[Place]:
-    """The machine's cores and GPUs, shared out among the jobs."""
+    """Split the machine's cores and GPUs among the concurrent jobs."""
     gpus = visible_gpus()
     jobs = options.jobs or max(1, len(gpus) * options.jobs_per_gpu)
     if gpus and jobs > len(gpus) * options.jobs_per_gpu:
@@ -312,42 +313,42 @@ def places(options: LocalOptions) -> list[Place]:
     found = []
     for number in range(jobs):
         first, end = (place * len(cores) // jobs for place in (number, number + 1))
-        share = tuple(cores[first : max(end, first + 1)])  # at least one, unless the system does not tell them
+        share = tuple(cores[first : max(end, first + 1)])  # at least one, if the system reports cores at all
         found.append(Place(share, gpus[number % len(gpus)] if gpus else None))
     return found
 
 
 def visible_gpus() -> list[str]:
-    """Names of the GPUs that this process may use, as CUDA_VISIBLE_DEVICES has them."""
+    """GPUs that this process may use, as named in CUDA_VISIBLE_DEVICES."""
     import torch
 
-    count = torch.cuda.device_count()  # opens none of them
+    count = torch.cuda.device_count()  # does not initialise CUDA
     shown = os.environ.get("CUDA_VISIBLE_DEVICES")
     return shown.split(",")[:count] if shown else [str(number) for number in range(count)]
 
 
 _OWN = ("--seed", "--view-seed", "--encoder", "--data", "--out")
-"""Flags in which the runs of a stack may differ."""
+"""Flags that may differ between the runs of a stack."""
 STACKED = "finetune"
 
 
 def kind_of(job: Job) -> tuple[str, ...]:
-    """What jobs have in common that stack, as far as it can be told before their encoders are there; () if none may."""
-    if job.section != STACKED or job.settings.get("views") == "0":  # then pixels are read, by an encoder a run
+    """Grouping key of jobs that may share a stack, before their encoders exist; () for jobs that cannot be stacked."""
+    if job.section != STACKED or job.settings.get("views") == "0":  # reads pixels, an encoder per run
         return ()
     words = list(job.words)
     for flag in _OWN:
         if flag in words:
             del words[words.index(flag) : words.index(flag) + 2]
-    return *words, *(job.settings.get(name, "") for name in ("task", "algorithm"))  # those that the encoder decides
+    return *words, *(job.settings.get(name, "") for name in ("task", "algorithm"))  # these two come from the encoder
 
 
 def width_of(job: Job, made_in: Path) -> int | None:
-    """Width of what a fine-tuning is given of its encoder, which is there; None if it names none that can be read.
+    """Width of the encoder features that a fine-tuning reads; None if its encoder cannot be read.
 
     Args:
         job: the fine-tuning.
-        made_in: which the paths in its command begin at.
+        made_in: directory to which the paths in its command are relative.
     """
     try:
         encoder = read_record(made_in / job.words[job.words.index("--encoder") + 1]).encoder
@@ -358,27 +359,27 @@ def width_of(job: Job, made_in: Path) -> int | None:
 
 
 def runs_alone(rows: Iterable[Row]) -> bool:
-    """Whether a job is no longer stacked, judging by its attempts: a stack that it was in could not do it."""
+    """Whether a job must run alone from now on, because a stack with it failed or was killed."""
     return any("stack" in row and row["cause"] in (FAILED, KILLED) for row in rows)
 
 
 def in_stacks(
     jobs: Iterable[Job], size: int, attempts: Mapping[str, list[Row]], alike: Callable[[Job], Hashable] = kind_of
 ) -> list[list[Job]]:
-    """Jobs by the process that does them, in their order: stacks of up to `size`, and single ones.
+    """Group jobs by process, in order: stacks of up to `size`, and single jobs.
 
     Args:
-        jobs: those to do.
-        size: most jobs of a stack.
-        attempts: at them, by name.
-        alike: equal for jobs that stack; false for one that does not.
+        jobs: jobs to group.
+        size: maximum jobs per stack.
+        attempts: previous attempts by job name.
+        alike: grouping key; equal for jobs that can share a stack, falsy for a job that runs alone.
     """
     found = groups(jobs, lambda job: job.name if runs_alone(attempts.get(job.name, ())) else alike(job) or job.name)
     return [group[first : first + size] for group in found.values() for first in range(0, len(group), size)]
 
 
 def words_of_stack(jobs: list[Job]) -> list[str]:
-    """The command that does some jobs, after `vd4rl-pomdp`."""
+    """The command that runs some jobs in one process, after `vd4rl-pomdp`: the jobs' words joined by "+"."""
     words = list(jobs[0].words)
     for job in jobs[1:]:
         words += ["+", *job.words[1:]]

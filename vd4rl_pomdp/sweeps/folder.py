@@ -1,16 +1,15 @@
-"""What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
+"""Files that a sweep writes beside its runs: plans, one row per attempt at a job, and the jobs' logs.
 
-    OUT/sweep/plans/GRID.json    made_in (the working directory), out, program (a file of one's own that the sweep
-                                 was started from), and the jobs of a grid: name, stage, folder, command, needs;
-                                 GRID~*.json those of a grid of one's own, of a part of one, or of one with other
-                                 settings
-    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, host, words (of its
-                                 command), log (below OUT); of a job in a stack also stack (its number of jobs)
-    OUT/sweep/logs/JOB.log       what a stack prints is in that of its first job
-    OUT/sweep/slurm/             what the tasks of a cluster print
+    OUT/sweep/plans/GRID.json    made_in (working directory), out, program (the user's Python file that started the
+                                 sweep, if any), and the grid's jobs: name, stage, folder, command, needs;
+                                 GRID~*.json: the same for a user's own, narrowed or changed grid
+    OUT/sweep/attempts.jsonl     one object per line: job, ended (Unix time), seconds, cause, line, host, words (of its
+                                 command), log (relative to OUT), and stack (number of jobs) if it ran in a stack
+    OUT/sweep/logs/JOB.log       output of the job; a stack writes to the log of its first job
+    OUT/sweep/slurm/             output of a cluster's tasks
 
-Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
-own folder says it.
+Each row is appended in one write, so several drivers can share a folder. Whether a job is finished is never read from
+here, only from the job's own folder.
 """
 
 from __future__ import annotations
@@ -34,47 +33,47 @@ from vd4rl_pomdp.sweeps.plan import Job
 DONE, INTERRUPTED, KILLED, UNAVAILABLE, FAILED = "done", "interrupted", "killed", "unavailable", "failed"
 """How an attempt at a job ended."""
 PASSING = (KILLED, UNAVAILABLE)
-"""What another attempt may not meet. A refusal, a defect or a divergence would only come again."""
+"""Transient causes, worth a retry. Bad input, a bug or a divergence would only recur."""
 TRIES = 5
-"""Attempts in a row that end so before a job has failed."""
+"""Consecutive transient failures after which a job counts as failed."""
 _RETRIED = "retried"
-"""Cause of a row that says: forget this job's failures."""
+"""Cause of the row that clears a job's earlier failures."""
 RUNNING, WAITING, BLOCKED = "running", "waiting", "blocked"
 _RATE_S = 3600.0
-"""A rate is that of the jobs that ended within so many seconds."""
+"""Window in seconds over which the rate of finished jobs is measured."""
 
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
-    """What a grid's plan is called, given its file and what narrows or changes it: each such command has its own."""
+    """Name of the plan for a grid file and the words that narrow or change it, e.g. "ladder" or "ladder~1a2b3c4d"."""
     told = sorted(words)
     return f"{grid}~{hashlib.blake2b(json.dumps(told).encode(), digest_size=4).hexdigest()}" if told else grid
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Jobs, and how their processes are started."""
+    """Jobs, and how to start their processes."""
 
     jobs: list[Job]
     made_in: Path
-    """The working directory of every job, which relative paths begin at."""
+    """Working directory of every job, to which relative paths refer."""
     out: Path
-    """The sweep's folder, as its jobs' commands name it."""
+    """The sweep's folder, as the jobs' commands name it."""
     program: list[str]
-    """What stands behind `python` in place of `-m vd4rl_pomdp`: a file of one's own that registers parts."""
+    """Arguments of `python` instead of `-m vd4rl_pomdp`: the user's own file that registers plug-ins."""
 
 
 class SweepFolder:
     """The files of a sweep below its folder."""
 
     def __init__(self, out: Path) -> None:
-        """Nothing is written."""
+        """Creates nothing on disk."""
         self.out = out
         self.path = out / "sweep"
-        """Where they lie."""
+        """Folder of the sweep's own files."""
         self._attempts = self.path / "attempts.jsonl"
 
     def keep_plan(self, name: str, jobs: Iterable[Job], program: Iterable[str] = ()) -> Plan:
-        """Write a plan, in place of what was written of it before; other drivers may do so at once."""
+        """Write a plan, replacing an earlier one of that name. Safe when several drivers write at once."""
         plan = Plan(list(jobs), Path.cwd(), self.out, list(program))
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
@@ -82,10 +81,10 @@ class SweepFolder:
         return plan
 
     def plans(self, name: str = "") -> list[Plan]:
-        """The plan of a name, or all; the jobs' folders as seen from here.
+        """The plan of that name, or all plans, with job folders resolved relative to `self.out`.
 
         Raises:
-            UserError: there is none, or one is damaged.
+            UserError: no plan is there, or one is damaged.
         """
         paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
         if not paths:
@@ -105,7 +104,8 @@ class SweepFolder:
         return plans
 
     def plans_to_do(self, name: str = "") -> list[Plan]:
-        """As `plans`; UserError if the folder was moved, so that their commands name another one."""
+        """Like `plans`, but raises UserError if the folder was moved, since the jobs' commands still name the old
+        place."""
         plans = self.plans(name)
         for plan in plans:
             if (plan.made_in / plan.out).resolve() != self.out.resolve():
@@ -116,29 +116,30 @@ class SweepFolder:
         return plans
 
     def jobs_of_others(self, name: str) -> list[Job]:
-        """The jobs of all plans but one, as they were written."""
+        """The jobs of all plans except `name`, as written."""
         paths = sorted((self.path / "plans").glob("*.json"))
         return [job for path in paths if path.stem != name for job in read_plan(path).jobs]
 
     def add(self, row: Row) -> None:
-        """Append the row of an attempt; DiskFullError if the disk takes a part of it at most."""
+        """Append the row of an attempt; DiskFullError if it could not be written whole."""
         line = (json.dumps(row) + "\n").encode()
         with disk_errors(self._attempts):
             self.path.mkdir(parents=True, exist_ok=True)
-            # Unbuffered, a line is one write, and appends of several drivers do not mix.
+            # Unbuffered, a line is one write, so appends of several drivers do not interleave.
             with self._attempts.open("ab+", buffering=0) as file:
                 end = file.seek(0, os.SEEK_END)
-                if end and os.pread(file.fileno(), 1, end - 1) != b"\n":  # a full disk cut the row before
+                if end and os.pread(file.fileno(), 1, end - 1) != b"\n":  # a full disk truncated the previous row
                     line = b"\n" + line
                 if file.write(line) < len(line):
                     raise DiskFullError(f"{self._attempts}: the disk is full")
 
     def forget(self, job: str) -> None:
-        """Have the job taken up as if it had never been tried."""
+        """Clear the job's failures, so that it is tried again."""
         self.add({"job": job, "cause": _RETRIED})
 
     def attempts(self, jobs: Iterable[Job]) -> dict[str, list[Row]]:
-        """By job, attempts at its present command since it was last taken up again; a line that was cut is left out."""
+        """Attempts by job name, at the job's current command and since the last `forget`. Truncated lines are
+        skipped."""
         found: dict[str, list[Row]] = {job.name: [] for job in jobs}
         words = {job.name: job.words for job in jobs}
         content = read_bytes(self._attempts) if self._attempts.exists() else b""
@@ -148,7 +149,7 @@ class SweepFolder:
                 rows = found[row["job"]]
                 if row["cause"] == _RETRIED:
                     rows.clear()
-                # A corrected command has not failed yet.
+                # Attempts at an older command do not count.
                 elif row["words"] == words[row["job"]] and row.keys() >= {"ended", "seconds", "line"}:
                     rows.append(row)
             except (ValueError, TypeError, KeyError):
@@ -157,7 +158,7 @@ class SweepFolder:
 
 
 def read_plan(path: Path) -> Plan:
-    """A plan as it was written; UserError if it is damaged."""
+    """Read a plan as written; UserError if it is damaged."""
     with damaged(path, "is damaged", "remove it and start `sweep run` again"):
         told = parse_json(read_bytes(path))
         jobs = [Job(**job | {"folder": Path(job["folder"])}) for job in told["jobs"]]
@@ -165,19 +166,19 @@ def read_plan(path: Path) -> Plan:
 
 
 def jobs_of(plans: Iterable[Plan]) -> list[Job]:
-    """The jobs of several plans, once each."""
+    """The jobs of several plans, without duplicates."""
     return list({job.name: job for plan in plans for job in plan.jobs}.values())
 
 
 def failed(rows: list[Row]) -> bool:
-    """Whether a job is not tried again, judging by its attempts: one failed, or too many in a row were of no use."""
-    causes = [row["cause"] for row in rows[-TRIES:]]  # an interruption among them begins the count anew
-    alone = not any("stack" in row for row in rows[-1:])  # a stack's failure may be another job's
+    """Whether a job is given up: its last attempt failed, or the last TRIES were all transient failures."""
+    causes = [row["cause"] for row in rows[-TRIES:]]  # an interruption among them restarts the count
+    alone = not any("stack" in row for row in rows[-1:])  # in a stack, another job may have failed
     return (causes[-1:] == [FAILED] and alone) or (len(causes) == TRIES and set(causes) <= {*PASSING})
 
 
 def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
-    """Of unfinished jobs, each after those it needs, the names of those that failed or need such a one."""
+    """Names of unfinished jobs that failed or depend on one that did. `jobs` must be in dependency order."""
     lost: set[str] = set()
     for job in jobs:
         if failed(rows[job.name]) or not lost.isdisjoint(job.needs):
@@ -186,7 +187,7 @@ def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
 
 
 def is_finished(job: Job) -> bool:
-    """Whether a job's folder says that it is finished, which one that cannot be read does not."""
+    """Whether a job's folder holds a finished result; False if it cannot be read."""
     try:
         with disk_errors(job.folder):
             return job.finished
@@ -195,12 +196,12 @@ def is_finished(job: Job) -> bool:
 
 
 def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]:
-    """Where a sweep stands.
+    """Progress of a sweep.
 
     Returns:
-        counts of jobs by state; per_hour: jobs that ended in the last hour, or since the sweep began, as a rate;
-        seconds_left at that rate, None without one; finished: whether nothing is left; states by job: done, running,
-        waiting, failed, or blocked by a failure before it; failures: the last attempt at every failed job.
+        counts: jobs by state. per_hour: rate over the last hour, or since the sweep began. seconds_left: at that
+            rate; None if it is 0. finished: whether nothing is left. states: by job name, done, running, waiting,
+            failed, or blocked by a failed dependency. failures: the last attempt of every failed job.
     """
     left = [job for job in jobs if not is_finished(job)]
     lost = lost_among(left, attempts)
@@ -224,12 +225,12 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
 
 
 def failure(row: Row, out: Path) -> str:
-    """The last attempt at a failed job of the sweep in `out`, as a line."""
+    """One line about the last attempt at a failed job of the sweep in `out`."""
     return f"failed: {row['job']}: {row['line']}" + (f" (see {out / row['log']})" if "log" in row else "")
 
 
 def in_lines(found: Mapping[str, Any], out: Path) -> list[str]:
-    """A status as text, of the sweep in `out`."""
+    """A status as lines of text; `out` is the sweep's folder."""
     counts = ", ".join(f"{number} {state}" for state, number in sorted(found["counts"].items()))
     left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
     shown = [

@@ -1,6 +1,6 @@
-"""A grid is data: sections of settings for every stage, where a list is an axis, in TOML or in a Python file.
+"""A grid is data: settings of every stage by section, where a list is an axis, in TOML or a Python file.
 
-    seed = [0, 1, 2]                      # what stands outside the sections is told to every training
+    seed = [0, 1, 2]                      # settings outside the sections go to every training
     preset = "cpu"
 
     [collect]
@@ -14,17 +14,17 @@
     [finetune]
     updates = 20000
 
-    [[block]]                             # a part of the grid: its settings replace those above
+    [[block]]                             # a part of the grid: its settings override those above
     pretrain = { method = "acro", history = "gru" }
 
-    [[where]]                             # settings of the cells that have others: no axes here
+    [[where]]                             # overrides for the cells that match `only`; no axes here
     only = ["task=cheetah_run"]
     finetune = { updates = 60000 }
 
-    [testing]                             # what `--testing` runs: its settings replace those of every block
+    [testing]                             # overrides for all blocks under `--testing`
     preset = "smoke"
 
-A grid without blocks is one. A Python file defines the same as a dict called GRID.
+A grid without [[block]] is a single block. A Python file defines the same as a dict called GRID.
 """
 
 from __future__ import annotations
@@ -52,30 +52,30 @@ SHARED = ("seed", "preset")
 _SETS = ("collect", "navigation_collect")
 _TRAININGS = ("pretrain", "finetune", "navigation_train")
 _FOLDERS = {"out", "data", "encoder"}
-"""Settings of the stages that a sweep sets."""
+"""Settings that the sweep itself fills in."""
 Values = dict[str, Any]
 Sections = dict[str, Values]
-"""Settings by section; those of SHARED under the name ""."""
+"""Settings by section; those of SHARED are under ""."""
 
 
 @dataclass(frozen=True)
 class GridCell:
-    """One point of a grid: a set, an encoder and a policy, or whatever of the chain a grid asks for."""
+    """One point of a grid: a dataset, plus the encoder and policy trained on it if the grid has these sections."""
 
     sections: Sections
-    """Settings without axes."""
+    """Settings, one value each."""
     named: Mapping[str, Sequence[str]]
-    """By section, the settings that tell this cell from others of its grid: axes, what a block says, and of a set what
-    a `where` says."""
+    """By section, settings that distinguish this cell within its grid and so appear in folder names: axes, a block's
+    own settings and, for datasets, those set by a `where`."""
 
     @property
     def chain(self) -> tuple[str, ...]:
-        """Its sections, in the order in which they depend on one another."""
+        """Its sections in dependency order, e.g. ("collect", "pretrain", "finetune")."""
         return tuple(name for name in SECTIONS if name in self.sections)
 
     @property
     def shared(self) -> Values:
-        """Values of SHARED, as far as they are told."""
+        """Values of SHARED that the grid sets."""
         return self.sections[""]
 
     @property
@@ -84,31 +84,31 @@ class GridCell:
         return self.shared.get("seed", 0)
 
     def value(self, name: str) -> Any:
-        """What it sets `section.name` to, or `name` in whichever section; None if it does not.
+        """Value of `section.name`, or of `name` in whichever section sets it; None if none does.
 
         Raises:
-            UserError: sections set that name to different values.
+            UserError: sections set `name` to different values.
         """
         return _value_of(self.sections, name)
 
 
 @dataclass(frozen=True)
 class Where:
-    """Settings of the cells that have others."""
+    """A [[where]] table: overrides for the cells that match its conditions."""
 
     only: list[str]
-    """Conditions, as `narrow` takes them."""
+    """Conditions, as in `narrow`."""
     sections: Sections
 
     def applied(self, cell: GridCell, last: Sections) -> GridCell:
-        """The cell with these settings, if it meets all conditions; what stands in `last` stays."""
+        """The cell with these overrides if it matches all conditions. Settings in `last` take precedence."""
         if not all(_in_words(cell.value(name)) in values for name, values in map(_condition, self.only)):
             return cell
         own = {
             section: {name: value for name, value in settings.items() if name not in last.get(section, {})}
             for section, settings in self.sections.items()
         }
-        # A set is known by its folder's name, which has to tell it from others; a run is found by what it computes.
+        # A dataset is identified by its folder's name, so overrides must show there; a run is identified by its recipe.
         more = {section: own.get(section, {}) if section in _SETS else {} for section in cell.named}
         named = {section: list(dict.fromkeys([*names, *more[section]])) for section, names in cell.named.items()}
         return GridCell(_merge(cell.sections, own), named)
@@ -116,20 +116,20 @@ class Where:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid as its file tells it."""
+    """A grid as read from its file."""
 
     name: str
     title: str
     common: Sections
-    """What all blocks begin with, axes as lists."""
+    """Settings shared by all blocks, axes as lists."""
     blocks: list[Sections]
-    """What each block says itself."""
+    """Settings of each block's own table."""
     wheres: list[Where]
     last: Sections
-    """Settings that replace all others: what `testing` and changes say."""
+    """Settings with the highest precedence: from [testing] and --change."""
 
     def cells(self) -> list[GridCell]:
-        """All cells, once each; the first seed of every condition comes before the second of any."""
+        """All cells without duplicates, ordered by seed: every condition runs its first seed before any second one."""
         cells: dict[str, GridCell] = {}
         for block in self.blocks:
             for cell in _product(_merge(self.common, block, self.last), block):
@@ -148,12 +148,12 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
     """Read a grid.
 
     Args:
-        name: of one that ships, or the path of a TOML or Python file.
-        changes: settings that replace those of every block: "pretrain.steps=100", "seed=0,1".
-        testing: whether the grid's `testing` settings replace its own.
+        name: a shipped grid, or the path of a TOML or Python file.
+        changes: overrides for all blocks, e.g. "pretrain.steps=100" or "seed=0,1".
+        testing: whether to apply the grid's [testing] overrides.
 
     Raises:
-        UserError: there is no such grid, or its file is none.
+        UserError: the grid does not exist or is invalid.
     """
     path = GRIDS / f"{name}.toml" if name in names() else Path(name)
     told = _read(path, name)
@@ -175,10 +175,10 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
 
 
 def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
-    """The cells whose settings have the named values: "method=mik+a,acro", "seed=0".
+    """The cells that match all conditions, e.g. "method=mik+a,acro" and "seed=0".
 
     Raises:
-        UserError: a condition is none, or no cell has such a value.
+        UserError: a condition is malformed, or no cell has one of its values.
     """
     for text in only:
         name, wanted = _condition(text)
@@ -197,7 +197,7 @@ def _read(path: Path, name: str) -> Values:
             told = tomllib.loads(text) if path.suffix == ".toml" else runpy.run_path(str(path)).get("GRID")
     except (UserError, Terminated):
         raise
-    except (Exception, SystemExit) as error:  # a file of Python may raise anything
+    except (Exception, SystemExit) as error:  # a Python file may raise anything
         raise UserError(f"{path}: is no grid ({type(error).__name__}: {error}); mend it") from error
     if not isinstance(told, dict):
         raise UserError(f"{path}: defines no dict called GRID; see the grids that ship for its form")
@@ -205,7 +205,7 @@ def _read(path: Path, name: str) -> Values:
 
 
 def _sections(table: Any) -> Sections:
-    """Settings by section of a table of a grid's file."""
+    """Settings by section, from one table of a grid's file."""
     if not isinstance(table, dict):
         raise UserError(f"{table!r} is no table of settings")
     sections: Sections = {"": {}}
@@ -222,7 +222,7 @@ def _sections(table: Any) -> Sections:
 
 
 def _where(table: Any, blocks: list[Sections]) -> Where:
-    """A [[where]] of a grid's file; its conditions have to speak of what stands in a block."""
+    """Parse a [[where]] table. Its conditions may only name values that occur in some block."""
     table = dict(table) if isinstance(table, dict) else {}
     only, sections = table.pop("only", None), _sections(table)
     if not isinstance(only, list) or not only or not all(isinstance(text, str) for text in only):
@@ -240,7 +240,7 @@ def _where(table: Any, blocks: list[Sections]) -> Where:
 
 
 def _change(text: str) -> Sections:
-    """A change as the command line tells it: "section.name=value", or "name=value" for one of SHARED."""
+    """Parse a change from the command line: "section.name=value", or "name=value" for one of SHARED."""
     where, equals, value = (part.strip() for part in text.partition("="))
     section, _, name = where.rpartition(".")
     if not equals or not name:
@@ -283,7 +283,7 @@ def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
 
 
 def _product(block: Sections, own: Sections) -> Iterator[GridCell]:
-    """The cells of a block, of which `own` is what its own table says."""
+    """The cells of a block; `own` holds the settings of its own table."""
     axes = [(section, name) for section in block for name, value in block[section].items() if isinstance(value, list)]
     named = {
         section: [name for name in settings if (section, name) in axes or name in own.get(section, ())]
@@ -297,7 +297,7 @@ def _product(block: Sections, own: Sections) -> Iterator[GridCell]:
 
 
 def _merge(*parts: Sections) -> Sections:
-    """Settings by section; of several for one name the last counts."""
+    """Merge settings by section; later parts override earlier ones."""
     merged: Sections = {}
     for part in parts:
         for section, settings in part.items():
@@ -306,7 +306,7 @@ def _merge(*parts: Sections) -> Sections:
 
 
 def _value_of(sections: Sections, name: str) -> Any:
-    """What some sections set a name to; as `GridCell.value`."""
+    """See `GridCell.value`."""
     section, _, own = name.rpartition(".")
     if section or name in sections.get("", {}):
         return sections.get(section, {}).get(own)
@@ -317,7 +317,7 @@ def _value_of(sections: Sections, name: str) -> Any:
 
 
 def _condition(text: str) -> tuple[str, list[str]]:
-    """Name and values of a condition: "method=mik+a,acro"."""
+    """Parse a condition into name and values: "method=mik+a,acro" -> ("method", ["mik+a", "acro"])."""
     name, equals, values = (part.strip() for part in text.partition("="))
     if not (name and equals):
         raise UserError(f"{text!r} is no condition: write name=value, or name=value,value")
@@ -325,7 +325,7 @@ def _condition(text: str) -> tuple[str, list[str]]:
 
 
 def _toml_value(text: str) -> Any:
-    """A TOML value, or else the text itself: words need no quotation marks."""
+    """Parse a TOML value, or return the text itself, so that words need no quotes."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -333,12 +333,12 @@ def _toml_value(text: str) -> Any:
 
 
 def _in_words(value: Any) -> str:
-    """A setting's value as conditions compare it: equal for equal numbers, however they are written."""
+    """Canonical text of a value for comparisons: equal for equal numbers however they are written (1e-3, 0.001)."""
     return str(_toml_value(value) if isinstance(value, str) else value)
 
 
 def _check_values(text: str, wanted: list[str], found: list[str]) -> None:
-    """Raise UserError if a condition names a value that was not found."""
+    """Raise UserError if a condition names a value that no cell has."""
     if not set(wanted) <= set(found):
         has = f"has {', '.join(dict.fromkeys(found))}" if set(found) != {"None"} else "sets nothing of that name"
         raise UserError(f"no cell has {text!r}: the grid {has}; write name=value,value")

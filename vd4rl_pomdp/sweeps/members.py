@@ -1,4 +1,4 @@
-"""Which runs are a grid's own, wherever and by whatever command they were made."""
+"""Decides which runs belong to a grid, whatever folder they are in and whichever command made them."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from vd4rl_pomdp.sweeps.stages import check_cells, config_of, recipe_of, recorde
 
 
 class GridMembers(Choice):
-    """The pretrainings and fine-tunings that a grid's cells ask for."""
+    """The pretraining and fine-tuning runs that a grid's cells ask for."""
 
     def __init__(self, name: str, cells: list[GridCell]) -> None:
-        """Learn what the cells compute.
+        """Work out what the cells compute.
 
         Args:
             name: of the grid, for messages.
-            cells: those that count.
+            cells: cells to include.
 
         Raises:
-            UserError: a stage would refuse a cell's settings, or a cell trains in a maze.
+            UserError: a cell has invalid settings, or trains in a maze.
         """
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
         self._policies: set[tuple[Any, ...]] = set()
-        """Values of LABELS of the policies that cells train."""
+        """Values of LABELS of the policies that the cells train."""
         check_cells(cells, name)
         for cell in cells:
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
-            data = set_of(cell, Path())  # told by how it was collected, not by where it lies
+            data = set_of(cell, Path())  # matched by its collection settings, not its path
             for section in cell.chain[1:]:
                 self._sets[recipe_of(cell, section)].append(data)
             if "finetune" in cell.chain:
@@ -47,14 +47,14 @@ class GridMembers(Choice):
                 self._policies.add((before["method"], *named, algorithm, cell.seed))
 
     def among(self, results: list[Result]) -> list[Result]:
-        """Those of some runs that are the grid's, in their order; UserError if none is."""
+        """The runs that belong to the grid, in order; UserError if none does."""
         found = [run for run in with_collections(results) if self._has(run)]
         if not found:
             raise UserError(f"none of {len(results)} runs is {self._asked}; `sweep run --dry-run` lists the cells")
         return found
 
     def asks(self, row: Row) -> bool:
-        """Whether a cell asks for a policy of these labels (`options.LABELS`), whatever its variant."""
+        """Whether some cell asks for a policy with these labels (`options.LABELS`), ignoring variants."""
         return without_options(row, LABELS) in self._policies
 
     @property
@@ -63,7 +63,7 @@ class GridMembers(Choice):
         return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
     def _has(self, run: Result) -> bool:
-        """Whether some cell asks for it; one on a set that nobody collected is told by task and quality."""
+        """Whether some cell asks for this run. Without collection settings (imported data), task and quality decide."""
         sets = self._sets.get(run.recipe, ())
         if run.record.get("collection"):
             return run.on_one_set and any(data.alike(run.record) for data in sets)

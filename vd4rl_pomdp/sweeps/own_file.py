@@ -1,4 +1,4 @@
-"""Parts of one's own in a sweep: its jobs are started as it was, by the file that registers the parts."""
+"""Sweeps with user plug-ins: jobs are started through the same Python file that registers the plug-ins."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.registry import BY_CALL, REGISTRIES, code_of
 
 JOB_VARIABLE = "VD4RL_POMDP_JOB"
-"""Set in the environment of a job's process: a second signal ends it no sooner, and it may start no sweep."""
+"""Set in the environment of a job's process: a second signal does not kill it early, and it may not start a sweep."""
 
 
 def own_program() -> list[str]:
-    """What stood behind `python` where this process was started from a file that adds parts; empty if it was not."""
+    """Arguments of `python` that started this process, if a user's file registered plug-ins; else empty."""
     main = sys.modules["__main__"]
     if not any(registry.has_added for registry in REGISTRIES.values()):
         return []
@@ -24,17 +24,17 @@ def own_program() -> list[str]:
 
 
 def in_words(program: list[str]) -> str:
-    """What one types in place of `vd4rl-pomdp`."""
+    """The command to type instead of `vd4rl-pomdp`, e.g. "python my_method.py"."""
     return shlex.join(["python", *program]) if program else "vd4rl-pomdp"
 
 
 def program_here() -> str:
-    """What one types in place of `vd4rl-pomdp` to have the parts that this process has."""
+    """The command to type instead of `vd4rl-pomdp` to get this process's plug-ins."""
     return in_words(own_program())
 
 
 def refuse_unknown_to_jobs(settings: Mapping[str, str]) -> None:
-    """Raise UserError if settings name a part that the process of a job could not know."""
+    """Raise UserError if settings name a plug-in that a job's process could not import."""
     if not own_program():
         for part, origin in code_of(settings)["plugins"].items():
             if origin == BY_CALL:

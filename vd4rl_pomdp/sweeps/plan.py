@@ -1,6 +1,6 @@
-"""From a grid's cells to jobs: one for every set, encoder and policy, whoever shares it, and which of them are done.
+"""From a grid's cells to jobs: one per dataset, encoder and policy, shared between cells, and which are done already.
 
-A run is known by what it computes (its recipe) and by the content of its set, wherever it lies and whoever made it.
+A run is identified by its recipe (what it computes) and the content of its dataset, not by its path or who made it.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told
 
 DATA = "data"
-"""Folder of the sets in a sweep's, unless another is named."""
+"""Default folder of the datasets, below the sweep's folder."""
 _DOWNLOADED = "84px"
-"""Folder in which a downloaded set has its shards."""
+"""Subfolder that holds the shards of a downloaded dataset."""
 _LONGEST = 160
-"""Bytes of settings in a folder's name, which has room for 255 in all."""
+"""Maximum bytes of settings in a folder's name (file systems allow 255 in all)."""
 _IN_NAMES = {
     "collect": ("task", "quality"),
     "pretrain": ("method", "corruption"),
@@ -42,38 +42,38 @@ _IN_NAMES = {
     "navigation_collect": ("maze",),
     "navigation_train": ("method",),
 }
-"""Settings that have a place of their own in a folder's name."""
+"""Settings that have a fixed place in a folder's name."""
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """A set that cells of a grid need: found below a folder, or to be collected there."""
+    """A dataset that cells of a grid need: already on disk, or to be collected there."""
 
     name: str
     folder: Path
     section: str
-    """Which command collects it."""
+    """Section of the grid, i.e. the command that collects it."""
     wanted: Mapping[str, Any]
-    """How it is collected, by setting."""
+    """Collection settings by name."""
 
     @property
     def foreign(self) -> bool:
-        """Whether shards are there that nothing here collected, such as a downloaded or an imported set."""
+        """Whether the folder holds shards that were not collected by this package, e.g. downloaded or imported ones."""
         collected = (self.folder / PLAN).exists() and "format" not in read_plan(self.folder)
         return not collected and bool(shard_files(self.folder))
 
     @property
     def there(self) -> bool:
-        """Whether nothing is left to collect."""
+        """Whether the dataset is complete."""
         return (self.folder / PROVENANCE).is_file() or self.foreign
 
     @cached_property
     def fingerprint(self) -> str:
-        """Name of its content; a set that was never opened before is decoded first."""
+        """Content hash; the first call on a new dataset decodes all of it."""
         return open_store(self.folder).fingerprint
 
     def check(self) -> None:
-        """Raise UserError unless its folder holds the set, or the set can be collected there."""
+        """Raise UserError unless the folder holds this dataset or it can be collected there."""
         if self.foreign:  # shards that nothing here collected
             shards = shard_paths(self.folder)
             if self.section != "collect":
@@ -99,19 +99,19 @@ class DataSet:
                 )
 
     def made(self, record: Mapping[str, Any]) -> bool:
-        """Whether a run, as its config.json tells it, was trained on this set."""
-        if self.there:  # then its content decides, which another machine's renderer may have made otherwise
+        """Whether a run, given its config.json, was trained on this dataset."""
+        if self.there:  # compare content: another machine's renderer may produce other pixels
             return record.get("inputs", {}).get("data") == self.fingerprint
         return self.alike(record)
 
     def alike(self, record: Mapping[str, Any]) -> bool:
-        """Whether a run was trained on a set that was collected as this one is, whatever came of it."""
+        """Whether a run's dataset has the same collection settings; its content may still differ."""
         collection = record.get("collection") or {}
         return bool(collection) and not differing(collection, self.wanted)
 
 
 def set_of(cell: GridCell, root: Path) -> DataSet:
-    """The set of a cell, below `root`."""
+    """The dataset of a cell, below `root`."""
     section, wanted = cell.chain[0], collection_of(cell)
     place = "/".join(wanted[name] for name in _IN_NAMES[section])
     name = place + _extras(cell, section)
@@ -128,12 +128,12 @@ def runs_below(out: Path) -> Iterator[Result]:
 
 
 def runs_kept(folders: Iterable[Path]) -> list[Result]:
-    """Every run of some results folders; UserError for a folder that is none."""
+    """Every run in some results folders; UserError for a folder without results."""
     return with_collections([run for folder in folders for run in read_results(folder)])
 
 
 def with_collections(runs: Iterable[Result]) -> list[Result]:
-    """Some runs, in their order; how a set was collected may be told by another run on the same content."""
+    """Fill in missing collection settings of runs from other runs on the same content. Keeps the order."""
     told = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
     return [
         replace(run, files=run.files | {"config": run.record | {"collection": told[run.data]}})
@@ -148,26 +148,26 @@ class Job:
     """One command of a sweep."""
 
     name: str
-    """What it makes: a folder below the sweep's, or data/ and a set's name."""
+    """Folder of its result below the sweep's folder, or "data/" and the dataset's name."""
     section: str
-    """Which stage it is."""
+    """Section of the grid, i.e. its stage."""
     folder: Path
     words: list[str]
-    """Its command line, after `vd4rl-pomdp`."""
+    """Its command line after `vd4rl-pomdp`."""
     needs: list[str] = field(default_factory=list)
-    """Names of the jobs that come before it."""
+    """Names of the jobs that must finish first."""
     done: bool = False
-    """Whether nothing is to do, although its folder does not tell: a kept row, or a set that was not collected here."""
+    """Marks as done a job whose folder cannot show it: a row kept elsewhere, or a dataset not collected here."""
     settings: dict[str, str] = field(default_factory=dict)
-    """Its settings and those of the stages before it, as words."""
+    """Its settings and those of the stages before it, as text."""
     recipe: str = ""
-    """What a training computes; empty for a set."""
+    """Recipe hash of a training; empty for a dataset."""
     content: str = ""
-    """Fingerprint of the set of the run that was found in its folder; empty where none was."""
+    """Fingerprint of the dataset of a run already in its folder; empty if there was none."""
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to do now; a run of another recipe, or on another set, does not count."""
+        """Whether the result is complete now. A run with another recipe or dataset content does not count."""
         if self.done or self.section not in STAGES:
             return self.done or (self.folder / PROVENANCE).is_file()
         if not (self.folder / TIMING_FILE).is_file():
@@ -177,26 +177,26 @@ class Job:
 
     @property
     def begun(self) -> bool:
-        """Whether something of it is there."""
+        """Whether its folder holds at least a started run."""
         return (self.folder / (CONFIG_FILE if self.section in STAGES else PLAN)).is_file()
 
 
 def plan_jobs(
     cells: Iterable[GridCell], out: Path, data: Path, kept: Iterable[Result] = (), others: Iterable[Job] = ()
 ) -> tuple[list[Job], list[str]]:
-    """The jobs of some cells, each after those it needs, and what one should know of those that are done.
+    """Jobs of some cells in dependency order, and warnings about finished ones. Writes nothing.
 
-    What only finished jobs would need is left out. Nothing is written.
+    Jobs that only finished jobs would need are left out.
 
     Args:
-        cells: those that `check_cells` lets pass.
+        cells: cells that passed `check_cells`.
         out: the sweep's folder.
-        data: folder of the sets.
-        kept: runs whose rows are kept, their folders being elsewhere.
-        others: jobs of other grids in `out`, begun or not.
+        data: folder of the datasets.
+        kept: runs known only by their rows; their folders are elsewhere.
+        others: jobs of other grids in `out`, started or not.
 
     Raises:
-        UserError: a folder holds another set.
+        UserError: a folder holds a different dataset.
     """
     planner = _Planner(out, data, kept, others)
     for cell in cells:
@@ -205,7 +205,7 @@ def plan_jobs(
 
 
 class _Planner:
-    """Jobs by what they make."""
+    """Collects jobs, without duplicates, by what they make."""
 
     def __init__(self, out: Path, data: Path, kept: Iterable[Result], others: Iterable[Job]) -> None:
         self._out, self._data = out, data
@@ -213,17 +213,17 @@ class _Planner:
         self._here, self._kept = (groups(runs, lambda run: run.recipe) for runs in (here, kept))
         self._folders = {run.path for run in here}
         self._names = {job.name: job.recipe for job in others}
-        """What has a name, by that name."""
+        """Recipe by name, for names already taken."""
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
         self._asked: set[str] = set()
-        """Names of the jobs that are the last of a cell."""
+        """Names of jobs that end a cell's chain."""
         self._of_other_code: Counter[str] = Counter()
         self._of_other_content: Counter[str] = Counter()
         self._on_other_encoders = 0
 
     def add(self, cell: GridCell) -> None:
-        """Want what a cell asks for."""
+        """Add the jobs of a cell."""
         data = set_of(cell, self._data)
         if data.name not in self._sets:
             data.check()
@@ -235,7 +235,7 @@ class _Planner:
         before = [self._jobs.setdefault((data.section, "", data.name), job)]
         values: dict[str, Any] = {}
         for section in cell.chain[1:]:
-            # A policy's folder is told by its encoder's settings, too.
+            # A policy's folder name also depends on the encoder's settings.
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
         self._ask(before[-1], data)
@@ -263,15 +263,15 @@ class _Planner:
         return self._jobs[key]
 
     def _free(self, name: str, own: str) -> str:
-        """A name that no other run has, be it in the plan, in another grid's, or from an earlier sweep."""
-        further = f"{name}~{own[:6]}"  # a second run of one recipe is on a set of other content
+        """A job name that no other run has in this plan, another grid's plan or an earlier sweep."""
+        further = f"{name}~{own[:6]}"  # same recipe, but the dataset's content differs
         candidates = chain([name, further], (f"{further}.{number}" for number in count(2)))
         return next(
             one for one in candidates if self._out / one not in self._folders and self._names.get(one, own) == own
         )
 
     def _ask(self, job: Job, data: DataSet) -> None:
-        """Want a job for itself, not for those that need it; a kept row is as good."""
+        """Request a job for its own result, not as a dependency. A finished run among `kept` satisfies it."""
         if job.name in self._asked:
             return
         self._asked.add(job.name)
@@ -283,12 +283,12 @@ class _Planner:
             self._jobs[job.section, job.recipe, data.name] = replace(job, done=True)
 
     def needed(self) -> list[Job]:
-        """The finished jobs, those that were asked for, and those that an unfinished one needs."""
+        """Finished jobs, requested jobs, and those that an unfinished one depends on."""
         found: list[Job] = []
         needed: set[str] = set()
-        for job in reversed(self._jobs.values()):  # backwards: whatever needs a job comes after it
+        for job in reversed(self._jobs.values()):  # backwards: dependents come after their dependencies
             if job.name in needed and job.section in STAGES:
-                job = replace(job, done=False)  # a kept row is no encoder to train on
+                job = replace(job, done=False)  # a kept row has no encoder to train on
             if not job.finished:
                 if job.name not in needed | self._asked:
                     continue
@@ -297,7 +297,7 @@ class _Planner:
         return found[::-1]
 
     def warnings(self) -> Iterator[str]:
-        """What counts, or does not, although one may think otherwise."""
+        """Reasons why runs do or do not count that a user may not expect."""
         for name, number in self._of_other_content.items():
             line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
             yield f"{name}: {line}: they do not count"
@@ -308,7 +308,7 @@ class _Planner:
 
 
 def _found(runs: Mapping[str, list[Result]], own: str, data: DataSet) -> Result | None:
-    """The run of a recipe on a set, a finished one if there is one; images that it adds are those of now."""
+    """A run with this recipe and dataset, preferably a finished one. Exogenous images must match the current ones."""
     fitting = []
     for run in runs.get(own, ()):
         images = run.record.get("inputs", {}).get("exogenous")
@@ -319,11 +319,11 @@ def _found(runs: Mapping[str, list[Result]], own: str, data: DataSet) -> Result 
 
 
 _images_in = cache(source_fingerprint)
-"""Name of the images that runs in a maze add, read once for all of them."""
+"""Content hash of a maze run's exogenous images, cached."""
 
 
 def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any]) -> str:
-    """Where a run goes, below the sweep's folder: TASK/QUALITY/CORRUPTION/METHOD,what_else_tells_it/seedN/..."""
+    """A run's folder below the sweep's: TASK/QUALITY/CORRUPTION/METHOD,OTHER_SETTINGS/seedN/..."""
     if section == "navigation_train":
         return f"{data}/{values['method']}{_extras(cell, section)}/seed{cell.seed}"
     shared = f"{data}/{values['corruption']}/{values['method']}{_extras(cell, 'pretrain')}/seed{cell.seed}"
@@ -333,7 +333,8 @@ def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any])
 
 
 def _extras(cell: GridCell, section: str) -> str:
-    """The other settings of a section that tell a cell from others: ",history=gru,max_k=1"; or their hash."""
+    """Suffix of a folder's name for the remaining distinguishing settings: ",history=gru,max_k=1", or a hash if too
+    long."""
     named = {name: cell.sections[section][name] for name in cell.named.get(section, ())}
     words = (f",{name}={value}" for name, value in named.items() if name not in _IN_NAMES[section])
     extras = "".join(words).replace("/", "_")

@@ -1,4 +1,4 @@
-"""What a sweep knows of each stage: its command, its settings, and how the settings of a run are recorded."""
+"""What a sweep knows about each stage: its command, its settings, and how a run records them."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ COMMANDS = {
     "navigation_collect": ("navigation", "collect"),
     "navigation_train": ("navigation", "train"),
 }
-"""Words of every section's command."""
+"""Command by section."""
 STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
-"""What a training's record calls its stage, by section."""
+"""Stage name in a training's record, by section."""
 _PARSERS: dict[str, Callable[[list[str], str], Any]] = {
     "collect": partial(parse, CollectConfig),
     "pretrain": partial(parse_stage, PretrainConfig),
@@ -40,24 +40,25 @@ _PARSERS: dict[str, Callable[[list[str], str], Any]] = {
     "navigation_collect": partial(parse_stage, MazeCollectConfig),
     "navigation_train": partial(parse_stage, NavigationConfig),
 }
-"""Every section's settings, read as its command line is: a grid takes and refuses what the command does, and a recipe
-is that of the run that the command makes."""
+"""Parser of each section's settings. It is the command's own, so a grid accepts and rejects what the command does, and
+gets the same recipe."""
 _READS = {"pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
-"""Folders that a stage is given, beside the one it writes."""
+"""Input folders of each stage."""
 _TAKES = {"collect": (), "navigation_collect": ("preset",)}
-"""What a stage takes of the shared settings, where that is not all of them."""
+"""Shared settings that a stage accepts, if not all of them."""
 
 
 def told(cell: GridCell, section: str) -> Values:
-    """What a cell tells a stage, in the order of its command line."""
+    """A cell's settings for a stage, in command-line order."""
     takes = _TAKES.get(section, tuple(cell.shared))
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
 
 
 def check_cells(cells: Sequence[GridCell], grid: str) -> None:
-    """Raise UserError, which begins with the grid's name, for settings that a stage does not have or take.
+    """Raise UserError, starting with the grid's name, for settings that a stage does not know or accept.
 
-    Whether they fit the set, the machine and one another the stage itself says: its job then fails by itself.
+    Whether they suit the dataset and the machine, and fit together, is checked by each job itself, which then fails
+    alone.
     """
     try:
         for cell in cells:
@@ -71,11 +72,11 @@ def check_cells(cells: Sequence[GridCell], grid: str) -> None:
 
 
 def config_of(cell: GridCell, section: str) -> Any:
-    """A stage's settings, as its own command line reads them, its folders left open."""
+    """A stage's config, parsed as its command line would be, with placeholder folders."""
     settings = told(cell, section)
     later = {"seed": settings.pop("seed", 0)}
     if section == "collect" and settings.get("quality", "expert") not in SET_QUALITIES:
-        later |= {"quality": str(settings["quality"])}  # of a set of one's own, which no command collects
+        later |= {"quality": str(settings["quality"])}  # a user's own dataset, which no command collects
         settings |= {"quality": "expert"}
     try:
         return replace(_parsed(section, tuple(words_of(settings))), **later)
@@ -85,19 +86,19 @@ def config_of(cell: GridCell, section: str) -> Any:
 
 @cache
 def _parsed(section: str, words: tuple[str, ...]) -> Any:
-    """The settings of a section, once for all seeds."""
+    """Parse a section's settings, cached across seeds."""
     line = [*words, *words_of(dict.fromkeys((*_READS.get(section, ()), "out"), "-"))]
     return _PARSERS[section](line, " ".join(("vd4rl-pomdp", *COMMANDS[section])))
 
 
 def collection_of(cell: GridCell) -> Values:
-    """What tells the set of a cell from others, as its collection.json has it."""
+    """Collection settings that identify a cell's dataset, as in collection.json."""
     config = config_of(cell, cell.chain[0])
     return collection(config) if isinstance(config, CollectConfig) else maze_collection(config)
 
 
 def recipe_of(cell: GridCell, section: str) -> str:
-    """Name of what a training of a cell computes but for the content of its data; as its run's records have it."""
+    """Hash of what a cell's training computes, apart from its data's content. Equals the one in the run's records."""
     record = {"format": FORMAT, "stage": STAGES[section], "config": recorded(cell, section)}
     if section != "finetune":
         return recipe(record, {})
@@ -106,11 +107,11 @@ def recipe_of(cell: GridCell, section: str) -> str:
 
 
 def recorded(cell: GridCell, section: str) -> Values:
-    """The config that a training records, folders aside."""
+    """The config that a training records, without folders."""
     config = config_of(cell, section)
-    if section == "pretrain":  # its set tells it the task
+    if section == "pretrain":  # the task comes from the dataset
         config = replace(config, task=cell.value("task") or config.task)
-    if section == "finetune":  # what its encoder's method cannot read is no part of what it trains with
+    if section == "finetune":  # drop settings that this encoder makes irrelevant
         before = config_of(cell, "pretrain")
         method = METHODS.named(before.method)
         remembers = history_of(before.method, method, before.history) != "none"

@@ -1,1 +1,1 @@
-"""The memories that come with the package, and what a memory is."""
+"""Built-in memories and their base class."""

@@ -1,4 +1,4 @@
-"""What a memory is, gated recurrent units, and a floor for memories."""
+"""Base class of memories, the GRU, and the integrator, a lower bound for memories."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ class MemoryOptions(Options):
     """Options of every memory."""
 
     hidden_dim: int = 256
-    """Width of the memory's output s_t."""
+    """Dimension of the memory's output s_t."""
     m: int | None = None
-    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
+    """Rows before t that s_t is computed from; None: the method's default (8 for fj and fj+a, else all)."""
 
     limits: ClassVar[Limits] = {"hidden_dim": 1, "m": 0}
 
 
 class Memory(nn.Module):
-    """A recurrence. What it puts out at row j depends on rows 0..j and on the state before row 0 alone."""
+    """A causal sequence model: output j depends only on rows 0..j and the initial state."""
 
     reach: int | None = None
-    """Rows that an output depends on, its own among them; None: all."""
+    """Number of most recent rows that an output depends on, its own included; None: all."""
     first_only: bool = False
-    """Whether of row 0 alone it reads the observation's features; of later rows then the actions."""
+    """Whether it reads the observation's features in row 0 only, and just the actions in later rows."""
     features: int
-    """Numbers at the beginning of a row that are the observation's features; `make_memory` tells."""
+    """Number of leading inputs of a row that are observation features; set by `make_memory`."""
 
     def initial_state(self, batch: int) -> Tensor:
-        """State before an episode's first row: (L, batch, W) zeros in the precision of its weights."""
+        """State before an episode's first row: (L, batch, W) zeros, with the dtype of the weights."""
         raise NotImplementedError
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, T, I) rows, T > 0, and an (L, B, W) state -> (B, T, hidden_dim), and the state after the last row."""
+        """Rows (B, T, I), T > 0, and state (L, B, W) -> outputs (B, T, hidden_dim) and the state after the last row."""
         raise NotImplementedError
 
 
@@ -64,19 +64,19 @@ class GRU(nn.GRU, Memory):
 
 
 class Integrator(GRU):
-    """A floor for memories: gated recurrent units that see the first observation, the actions since and the time.
+    """A lower bound for memories: a GRU that sees the first observation, the actions since then, and the time.
 
         h_t = GRU(h_{t-1}, [e(o_0), a_{t-1}, log(1 + t)]),   s_t = h_t
 
-    Row 0 is the first that it reads: an episode's or, under a history window or a random history, that one's. No pixel
-    of a later row is read, so what s_t tells is what the first observation and adding up actions tell. Its state is
-    that of the GRU, how many rows it has read, and e(o_0).
+    Row 0 is the first row it reads: an episode's first or, with a history window or a random history, the first of
+    those. No later pixel is read, so s_t holds only what follows from the first observation and the actions. Its state
+    consists of the GRU's state, the number of rows read, and e(o_0).
     """
 
     first_only = True
 
     def __init__(self, inputs: int, options: GRUOptions) -> None:
-        super().__init__(inputs + 1, options)  # and the time
+        super().__init__(inputs + 1, options)  # + 1 for the time
         self.features = inputs
 
     def initial_state(self, batch: int) -> Tensor:

@@ -3,8 +3,8 @@
     x = W row,   then in every layer   u = norm(x),   h_t = lambda h_{t-1} + gamma (B u_t),
                                        y_t = gelu(Re(C h_t) + D u_t),   x = x + y sigmoid(G y),   and s_t = norm(x)
 
-lambda = exp(-exp(nu) + i exp(theta)) is diagonal and within the unit circle; gamma is sqrt(1 - |lambda|^2) to begin
-with, so that slow units' states are no larger than fast ones'. A window takes log2(T) steps, a stream one a row.
+lambda = exp(-exp(nu) + i exp(theta)) is diagonal and inside the unit circle. gamma is initialised to
+sqrt(1 - |lambda|^2), so that slow and fast units have states of equal scale. A window takes a scan of log2(T) steps.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class LRUOptions(MemoryOptions):
     lru_layers: int = 2
     """Layers of the linear recurrence."""
     lru_units: int | None = None
-    """Complex units of a layer's state; None: 3/8 of hidden_dim, with as many parameters as a GRU of one layer."""
+    """Complex units per layer; None: 3/8 of hidden_dim, which matches a one-layer GRU in parameters."""
     r_min: float = 0.0
-    """Least |lambda| to begin with."""
+    """Smallest |lambda| at initialisation."""
     r_max: float = 1.0
-    """Greatest |lambda| to begin with."""
+    """Largest |lambda| at initialisation."""
     max_phase: float = 2 * math.pi
-    """Greatest phase of lambda to begin with, in radians."""
+    """Largest phase of lambda at initialisation, in radians."""
 
     limits: ClassVar[Limits] = {
         "lru_layers": (1, 64),
@@ -46,19 +46,19 @@ class LRUOptions(MemoryOptions):
     }
 
     def check(self) -> None:
-        """Raise UserError for values that cannot work."""
+        """Raise UserError for invalid values."""
         super().check()
         if self.r_min >= self.r_max:
             raise UserError(f"--r-min is {self.r_min}, --r-max {self.r_max}: choose a greater --r-max")
 
 
 class LRU(Memory):
-    """See the module; about as many parameters as a GRU of one layer and the same hidden_dim."""
+    """Stacked LRU layers; see the module. About as many parameters as a one-layer GRU of the same hidden_dim."""
 
     def __init__(self, inputs: int, options: LRUOptions) -> None:
         super().__init__()
         dim, shape = options.hidden_dim, (options.lru_layers, options.lru_units or max(1, 3 * options.hidden_dim // 8))
-        # |lambda|^2 uniform: even over the ring's area. Neither 1, which would not decay, nor 0, which has no logarithm
+        # |lambda|^2 uniform makes lambda uniform over the ring's area; clamped, as 1 never decays and log(0) is -inf
         square = torch.empty(shape).uniform_(options.r_min**2, options.r_max**2).clamp(1e-6, 1 - 1e-6)
         self.nu = nn.Parameter((-0.5 * square.log()).log())
         self.theta = nn.Parameter(torch.empty(shape).uniform_(0, options.max_phase).clamp(min=1e-6).log())
@@ -69,7 +69,7 @@ class LRU(Memory):
         self.norm = nn.LayerNorm(dim)
 
     def initial_state(self, batch: int) -> Tensor:
-        """(L, batch, 2 N): real and imaginary parts in turns."""
+        """(L, batch, 2 N), real and imaginary parts interleaved."""
         return self.nu.new_zeros(len(self.nu), batch, 2 * self.nu.shape[1])
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,14 +89,14 @@ class _Layer(nn.Module):
         super().__init__()
         self.norm = nn.LayerNorm(dim)
         self.b = nn.Linear(dim, 2 * units, bias=False)
-        self.c = nn.Linear(2 * units, dim, bias=False)  # Re C and -Im C: Re(C h) is linear in h's real numbers
+        self.c = nn.Linear(2 * units, dim, bias=False)  # Re C and -Im C: Re(C h) is linear in (Re h, Im h)
         self.d = nn.Parameter(torch.randn(dim))
         self.gate = nn.Linear(dim, dim)
         nn.init.normal_(self.b.weight, std=(2 * dim) ** -0.5)
         nn.init.normal_(self.c.weight, std=units**-0.5)
 
     def forward(self, x: Tensor, decay: Tensor, scale: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, T, D), and h (B, N) before -> (B, T, D), and the real numbers (B, 2 N) of h after."""
+        """(B, T, D) and complex h (B, N) before row 0 -> (B, T, D) and the final h as (B, 2 N) reals."""
         u = self.norm(x)
         h = scan(decay, torch.view_as_complex(self.b(u).unflatten(2, (-1, 2)) * scale), before)
         h = torch.view_as_real(h).flatten(2)
@@ -105,16 +105,16 @@ class _Layer(nn.Module):
 
 
 def scan(decay: Tensor, inputs: Tensor, before: Tensor) -> Tensor:
-    """h_t = decay h_{t-1} + inputs_t for all rows at once (Hillis and Steele 1986).
+    """Parallel scan of h_t = decay h_{t-1} + inputs_t (Hillis and Steele 1986).
 
     Args:
-        decay: (N,) complex, within the unit circle.
+        decay: (N,) complex, inside the unit circle.
         inputs: (B, T, N) complex.
         before: (B, N) complex, h before the first row.
 
     Returns:
-        (B, T, N). Every step doubles the rows that have been added up. Nothing is divided by a power of decay, so this
-        is as stable as going row by row.
+        (B, T, N). Each of log2(T) steps doubles the span that is summed. It never divides by powers of decay, so it is
+        as stable as the sequential recurrence.
     """
     first = (inputs[:, 0] + decay * before)[:, None]
     h = torch.cat([first, inputs[:, 1:]], dim=1) if inputs.shape[1] > 1 else first

@@ -1,12 +1,12 @@
-"""A causal transformer whose layers attend to a window of rows.
+"""A causal transformer with sliding-window attention.
 
     x = W row,   then in every layer   x = x + Attention(norm(x)),   x = x + MLP(norm(x)),   and s_t = norm(x)
 
-Pre-norm, without dropout. Scores are q_i k_j / sqrt(d) + r_{i-j}: a bias for every head and distance (Raffel et al.
-2020, arXiv 1910.10683, without its buckets) that begins as ALiBi's (Press et al. 2022, arXiv 2108.12409). They know
-distances alone, so that a stream, which does not count its rows, gives what a whole window gives.
+Pre-norm, without dropout. Scores are q_i k_j / sqrt(d) + r_{i-j}, with a learned bias per head and distance (Raffel et
+al. 2020, arXiv 1910.10683, without its buckets), initialised as ALiBi (Press et al. 2022, arXiv 2108.12409). Positions
+are relative only, so stepping row by row gives the same outputs as a whole window, without a row counter.
 
-The state is what the attention reads of the last rows: whether there was one, and every layer's keys and values.
+The state is a KV cache of the last window - 1 rows, with a flag for each row that says whether it exists.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vd4rl_pomdp.core.options import Limits
 from vd4rl_pomdp.nn.memories.base import Memory, MemoryOptions
 
 _NEVER = -1e30
-"""Added to the score of what is not attended to: its weight is zero exactly, and two of them are still finite."""
+"""Added to masked scores: the softmax weight is exactly zero, and the sum of two of them is still finite."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,15 @@ class TransformerOptions(MemoryOptions):
     transformer_layers: int = 2
     """Layers of the transformer."""
     transformer_heads: int = 4
-    """Heads of a layer's attention."""
+    """Attention heads per layer."""
     attention_window: int = 32
-    """Rows that a layer attends to, the row itself among them; through L layers a state sees L (window - 1) + 1."""
+    """Rows that a layer attends to, the current one included; with L layers a state sees L (window - 1) + 1 rows."""
 
     limits: ClassVar[Limits] = {"transformer_layers": (1, 64), "transformer_heads": 1, "attention_window": 2}
 
 
 class Transformer(Memory):
-    """See the module; about as many parameters as a GRU of one layer and the same hidden_dim."""
+    """See the module. About as many parameters as a one-layer GRU of the same hidden_dim."""
 
     def __init__(self, inputs: int, options: TransformerOptions) -> None:
         super().__init__()
@@ -52,11 +52,11 @@ class Transformer(Memory):
         self.layers = nn.ModuleList(_Layer(options.hidden_dim, heads, width) for _ in range(layers))
         slopes = 2.0 ** (-8 * torch.arange(1, heads + 1) / heads)
         self.bias = nn.Parameter((-slopes[:, None] * torch.arange(self.window).flip(0)).repeat(layers, 1, 1))
-        """(L, heads, window): of every distance, the farthest first."""
+        """(L, heads, window): bias per distance, from window - 1 down to 0."""
         self.norm = nn.LayerNorm(options.hidden_dim)
 
     def initial_state(self, batch: int) -> Tensor:
-        """(1, batch, (window - 1) * (1 + L * (key and value)))."""
+        """(1, batch, (window - 1) * (1 + L * 2 * A)): flags, then each layer's keys and values, all zero."""
         return self.bias.new_zeros(1, batch, sum(self._sizes))
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,7 +64,7 @@ class Transformer(Memory):
         batch, count, _ = rows.shape
         there, *pasts = state[0].split(self._sizes, dim=1)
         there = torch.cat([there, there.new_ones(batch, count)], dim=1)
-        # queries in blocks of up to `window`: a row of a long episode has as many scores as one of a short window
+        # queries in blocks of at most `window` rows: the cost per row does not grow with the episode's length
         size = min(count, self.window)
         masks = self._biases(size)[:, None] + ((_blocks(there, size, self.window) - 1) * -_NEVER)[:, None, None]
         x, kept = self.read(rows), [there[:, count:]]
@@ -74,8 +74,8 @@ class Transformer(Memory):
         return self.norm(x), torch.cat(kept, dim=1)[None]
 
     def _biases(self, size: int) -> Tensor:
-        """(L, heads, size, window - 1 + size): of a block's queries on what they may read."""
-        # every row of the matrix is the one above, moved by one: so is a padded row that is written end to end
+        """(L, heads, size, window - 1 + size): biases between a block's queries and the keys it may read."""
+        # Toeplitz: each row is the previous one shifted by one, so repeat one padded row and reshape
         row = pad(self.bias, (0, size), value=_NEVER)
         written = row[:, :, None].expand(-1, -1, size, -1).flatten(2)
         return written[..., : size * (self.window - 1 + size)].unflatten(2, (size, -1))
@@ -91,7 +91,7 @@ class _Layer(nn.Module):
         self.mlp_in, self.mlp_out = nn.Linear(dim, units), nn.Linear(units, dim)
 
     def forward(self, x: Tensor, past: Tensor, mask: Tensor, size: int) -> tuple[Tensor, Tensor]:
-        """(B, T, D), keys and values (B, window - 1, 2 A) before -> (B, T, D), and those (B, window - 1 + T, 2 A)."""
+        """(B, T, D), cached keys and values (B, window - 1, 2 A) -> (B, T, D), all of them (B, window - 1 + T, 2 A)."""
         batch, count, _ = x.shape
         q, new = self.qkv(self.norm(x)).split([self.width, 2 * self.width], dim=2)
         seen = torch.cat([past, new], dim=1)
@@ -104,7 +104,7 @@ class _Layer(nn.Module):
 
 
 def _blocks(x: Tensor, size: int, window: int) -> Tensor:
-    """What every `size` rows of (B, window - 1 + T, ...) read, zeros behind: (B * blocks, window - 1 + size, ...)."""
+    """Overlapping blocks of (B, window - 1 + T, ...), zero-padded: (B * blocks, window - 1 + size, ...)."""
     rows = x.shape[1] - window + 1
     if rows == size:
         return x
