@@ -138,8 +138,8 @@ def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, decision
 
     Args:
         config: the settings as given.
-        algorithm: algorithm that the encoder's method dictates (end-to-end methods such as bc); empty if the
-            encoder is frozen.
+        algorithm: algorithm that the encoder's method dictates (end-to-end methods such as bc); empty if the encoder is
+            frozen.
         remembers: whether the encoder has memory.
         decisions: decisions in one episode of the task; the default `eval_length` is raised to it.
     """

@@ -231,12 +231,12 @@ def evaluate_run(
 
     Args:
         run: its folder.
-        corruption: name of the corruption to evaluate under, with the run's options where they apply. None: both
-            the run's own corruption and no corruption.
+        corruption: name of the corruption to evaluate under, with the run's options where they apply. None: both the
+            run's own corruption and no corruption.
         episodes: episodes per corruption, as long as in the run's own evaluations.
         workers: processes; 0: one per core.
-        options: overrides of that corruption's options; the rows' `evaluated_under` names those that differ from
-            the run's.
+        options: overrides of that corruption's options; the rows' `evaluated_under` names those that differ from the
+            run's.
 
     Returns:
         Rows of `episodes.csv` (`corruption` is that of training, `step` that of the policy), and their episodes.

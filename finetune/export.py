@@ -22,17 +22,16 @@ KEPT = ("episode", "episode_seed", "return", "length", "score", "evaluated_under
 
 
 def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> Row:
-    """Round a run's encoder and policy to half precision, evaluate them, and write both and a card into an agent's
-    folder.
+    """Round a run's encoder and policy to float16, evaluate them, and write both and a card as an agent's folder.
 
-        Args:
-            run: folder of a finished fine-tuning.
-            out: folder to create; may exist if empty.
-            episodes: evaluation episodes, each under the training corruption and under none.
-            workers: processes; 0: one per core.
+    Args:
+        run: folder of a finished fine-tuning.
+        out: folder to create; may exist if empty.
+        episodes: evaluation episodes, each under the training corruption and under none.
+        workers: processes; 0: one per core.
 
-        Raises:
-            UserError: `run` is no finished fine-tuning or is damaged, or `out` is not empty.
+    Raises:
+        UserError: `run` is no finished fine-tuning or is damaged, or `out` is not empty.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
@@ -73,19 +72,18 @@ def replay_agent(folder: Path) -> Row:
 
 
 def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple[list[Row], list[list[Episode]]]:
-    """Play the same episodes with several agents of a task, under the first agent's corruption. First episodes are
-    filmed.
+    """Play the same episodes with several agents, under the first one's corruption. First episodes are filmed.
 
-        Args:
-            names: shipped agents, or folders.
-            episodes: episodes per agent.
-            workers: processes; 0: one per core.
+    Args:
+        names: shipped agents, or folders.
+        episodes: episodes per agent.
+        workers: processes; 0: one per core.
 
-        Returns:
-            The agents' cards, and their episodes.
+    Returns:
+        The agents' cards, and their episodes.
 
-        Raises:
-            UserError: an agent is unknown or damaged, or the agents' tasks differ.
+    Raises:
+        UserError: an agent is unknown or damaged, or the agents' tasks differ.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)

@@ -133,8 +133,7 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
         frozen: the encoder and its dataset.
         histories: which features there are.
         views: number of draws of corruption and shift.
-        kept: file that keeps the features for resuming; the run itself checks that dataset and encoder are
-            unchanged.
+        kept: file that keeps the features for resuming; the run itself checks that dataset and encoder are unchanged.
         encoder: hash of the encoder's weights (`encoder_hash`).
 
     Returns:

@@ -64,8 +64,8 @@ class HistoryOptions(Options):
 class Histories:
     """A dataset's transitions, and which of them have a random history in each view.
 
-    Features of a view are numbered: first the dataset's N rows with full histories, then the first ends, then the
-    last ends, of the R transitions with a random history.
+    Features of a view are numbered: first the dataset's N rows with full histories, then the first ends, then the last
+    ends, of the R transitions with a random history.
     """
 
     def __init__(self, dataset: Dataset, options: Options, n_step: int, seed: int) -> None:

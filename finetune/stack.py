@@ -30,8 +30,7 @@ class Stack:
     """Algorithms of S >= 2 runs of the same kind, options, sizes and number of updates done."""
 
     def __init__(self, runs: Sequence[Algorithm]) -> None:
-        """Take over the runs' state. Their networks become slices of the stack's; `settle` writes back everything
-        else."""
+        """Take over the runs' state: their networks become slices of the stack's. `settle` writes back the rest."""
         first = runs[0]
         device = first.policy.standardise.mean.device
         with fork_rng(devices=[]):  # these initial weights are overwritten; keep the global RNG state

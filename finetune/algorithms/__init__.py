@@ -36,5 +36,4 @@ ALGORITHMS: Registry[type[Algorithm]] = Registry(
     "a class of finetune.algorithms.Algorithm",
     lambda name, part: refuse_options(part.options),
 )
-"""All algorithms. Packages add theirs through the entry-point group `vd4rl_pomdp.algorithms`; each entry names a
-class."""
+"""All algorithms. Packages add theirs as classes through the entry-point group `vd4rl_pomdp.algorithms`."""

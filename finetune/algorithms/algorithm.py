@@ -43,9 +43,9 @@ class Loss(NamedTuple):
 class Algorithm(ABC):
     """Trains a policy on batches of representations.
 
-    When updates are replayed as CUDA graphs, Python runs only a few of them. When runs are stacked
-    (`finetune.stack`), `update` sees the batches of all runs at once, but each loss sees one. An algorithm that
-    follows this interface needs no extra code for either.
+    When updates are replayed as CUDA graphs, Python runs only a few of them. When runs are stacked (`finetune.stack`),
+    `update` sees the batches of all runs at once, but each loss sees one. An algorithm that follows this interface
+    needs no extra code for either.
     """
 
     options: type[Options] = Options
@@ -63,8 +63,7 @@ class Algorithm(ABC):
             options: an instance of the class's `options`, stored as `settings`.
             learning_rate: for all optimisers.
             updates: total number of updates, for schedules; stored as `planned`.
-            draws: source of random numbers. Draw in `update`, never in a loss: a stack's update draws for all
-                runs.
+            draws: source of random numbers. Draw in `update`, never in a loss: a stack's update draws for all runs.
         """
         self.policy, self.settings, self.learning_rate = policy, options, learning_rate
         self.planned, self.draws = updates, draws
@@ -91,8 +90,8 @@ class Algorithm(ABC):
 
         Args:
             batch: transitions of representations; for stacked runs, tensors have a leading dimension S.
-            encoder: optimiser of the encoder that computed `batch.z`, if it is trained. It steps along the
-                first loss, the only one whose gradient may reach `batch.z`.
+            encoder: optimiser of the encoder that computed `batch.z`, if it is trained. It steps along the first loss,
+                the only one whose gradient may reach `batch.z`.
 
         Returns:
             Detached scalars of all losses by name; (S,) for stacked runs.

@@ -10,7 +10,7 @@ Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py; noise: drqbc/util
 
 Differences:
 - Representations go straight into the policy, standardised if the encoder is frozen. The authors' actor begins with a
-trunk (Linear, LayerNorm, Tanh); here memoryless encoders end with one, frozen or not (see `end_to_end`).
+  trunk (Linear, LayerNorm, Tanh); here memoryless encoders end with one, frozen or not (see `end_to_end`).
 - Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
 """
 
@@ -65,9 +65,8 @@ def noise_at(update: int | Tensor, planned: int) -> float | Tensor:
 
     Args:
         update: updates done, see `Algorithm.updates`.
-        planned: total updates. The noise decays over half of them if that is sooner than in V-D4RL, which trains
-            for 550,000: noise that is still large at the end of training leaves the policy's actions pushed
-            outwards.
+        planned: total updates. The noise decays over half of them if that is sooner than in V-D4RL, which trains for
+            550,000: noise that is still large at the end of training leaves the policy's actions pushed outwards.
     """
     done = share_of(update, min(NOISE_UPDATES, planned / 2))
     return NOISE_START + done * (NOISE_END - NOISE_START)

@@ -12,9 +12,9 @@ to 0.1 over 250k updates (or half of a shorter training) and is also added to th
 
 Differences from the authors' training loop:
 - Representations go straight into the networks, standardised if the encoder is frozen. The authors' actor and critic
-each begin with their own trunk (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's trunk is
-averaged like the rest of it. Here memoryless encoders end with such a layer, shared by all, frozen or not (see
-`end_to_end`).
+  each begin with their own trunk (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's trunk
+  is averaged like the rest of it. Here memoryless encoders end with such a layer, shared by all, frozen or not (see
+  `end_to_end`).
 - Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
 """
 

@@ -85,8 +85,7 @@ class Flow(nn.Module):
 
 
 class NoiseIn(nn.Linear):
-    """Contribution of noise to a policy's first hidden layer. It is 0 at zero noise, so the policy alone is mu(z,
-    0)."""
+    """Contribution of noise to a policy's first hidden layer: 0 at zero noise, where the policy is mu(z, 0)."""
 
     def __init__(self, action_dim: int, hidden: int) -> None:
         super().__init__(action_dim, hidden, bias=False)

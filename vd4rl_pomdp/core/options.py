@@ -44,8 +44,7 @@ Limits = Mapping[str, float | tuple[float, float]]
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a plug-in; this base class has none. Fields of subclasses need a default and a docstring and become
-    flags."""
+    """Options of a plug-in; here none. Subclass fields need a default and a docstring and become flags."""
 
     limits: ClassVar[Limits] = {}
     """Valid ranges of the class's own numeric fields."""
@@ -124,8 +123,7 @@ class StageConfig:
         return type(self).of(**({"preset": self.preset} | self._chosen() | told | changes))
 
     def with_known(self, **settings: Any) -> Self:
-        """A copy with those of the given settings that exist here. Useful to shrink sizes, whatever plug-ins are
-        chosen."""
+        """A copy with those of the given settings that exist here, e.g. sizes, whatever plug-ins are chosen."""
         known = flat(self)
         return self.altered(**{name: value for name, value in settings.items() if name in known})
 

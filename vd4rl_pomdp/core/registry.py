@@ -35,13 +35,12 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """See the class.
 
         Args:
-            kind: name of the kind in messages, e.g. `frame encoder`. It also gives the setting that names a
-                plug-in, `frame_encoder`, and the entry-point group, `vd4rl_pomdp.frame_encoders`.
+            kind: name of the kind in messages, e.g. `frame encoder`. It also gives the setting that names a plug-in,
+                `frame_encoder`, and the entry-point group, `vd4rl_pomdp.frame_encoders`.
             own: the package's plug-ins by name.
             fits: whether an object is a plug-in of this kind.
             expected: description of such an object, for messages.
-            refuse: raises UserError for a name or object of this kind that cannot work; it need not name the
-                plug-in.
+            refuse: raises UserError for a name or object of this kind that cannot work; it need not name the plug-in.
             setting: the setting that names a plug-in, if not derived from `kind`.
             group: the entry-point group, if not derived from the setting.
         """

@@ -32,12 +32,11 @@ class StateScale:
         return cls(values.mean(0), torch.where(variance > LEAST_VARIANCE, variance, 0).sqrt(), pose)
 
     def noise(self, pose: float, velocity: float) -> Tensor:
-        """Standard deviations (P,) float64 of Gaussian noise whose mean absolute value is a percentage of each
-        coordinate's std.
+        """Std (P,) float64 of Gaussian noise whose mean absolute value is a percentage of each coordinate's std.
 
-                Args:
-                    pose: percent, for poses.
-                    velocity: percent, for velocities.
+        Args:
+            pose: percent, for poses.
+            velocity: percent, for velocities.
         """
         percent = torch.full_like(self.std, velocity)
         percent[: self.pose] = pose

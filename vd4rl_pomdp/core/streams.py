@@ -158,8 +158,7 @@ class RandomStream:
         return [generator.get_state() for generator in self._generators]
 
     def _draw_steps(self, generator: torch.Generator, run: int, steps: int, rows: Tensor | None = None) -> None:
-        """Draw the numbers for `steps` steps of a run from the block's first turn on; store them in `rows` (steps,
-        bytes) if given."""
+        """Draw a run's numbers for `steps` steps from the block's first turn on, into `rows` (steps, bytes) if any."""
         for step in range(steps):
             turn = (self._first + step) % len(self._asked)
             for draw, offset in zip(self._asked[turn], self._offsets[turn], strict=True):

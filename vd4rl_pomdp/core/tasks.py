@@ -58,17 +58,15 @@ class Layout:
     quaternions: tuple[int, ...] = ()
     """First index of each unit quaternion's four positions; q and -q look the same."""
     beside: tuple[int, ...] = ()
-    """First index of the two ground positions of each other body; the camera sees them relative to the travelling
-    body."""
+    """First of two ground positions of each other body, seen by the camera relative to the travelling one."""
     unseen: tuple[int, ...] = ()
     """Positions of invisible bodies, which encode upcoming events of the episode."""
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
         """Visible pose of (..., P) simulator states, equal for states that look equal.
 
-        Columns: limited positions, sine and cosine of turning angles, then two columns of every quaternion's
-            rotation matrix (Zhou et al. 2019, arXiv 1812.07035). Other bodies' ground positions are relative to
-            the travelling body.
+        Columns: limited positions, sine and cosine of turning angles, then two columns of every quaternion's rotation
+        matrix (Zhou et al. 2019, arXiv 1812.07035). Other bodies' ground positions are relative to the travelling body.
         """
         positions, turning = physics[..., : self.positions].copy(), physics[..., list(self.turning)]
         for first in self.beside:

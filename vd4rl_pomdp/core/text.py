@@ -41,8 +41,7 @@ def _fence(text: str, least: int) -> str:
 
 
 def plain(text: str, width: int | None = None) -> str:
-    """Escape text for matplotlib: no math between dollars, no leading underscore (hidden labels); wrapped to
-    `width`."""
+    """Escape text for matplotlib (no $math$, no leading underscore, which hides a label); wrap to `width`."""
     shown = one_line(text)
     lines = textwrap.wrap(shown, width, break_long_words=True) if width else [shown]
     joined = "\n".join(lines).replace("$", r"\$")

@@ -1,16 +1,17 @@
-"""Environments: tasks as the data shows them, with the corruptions of the benchmark; and the mazes.
+"""Environments: the data sets' tasks with the benchmark's corruptions, and the mazes.
 
-Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
-`vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
-`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun`, `HumanoidWalk`, `ReacherJump`,
-`PointMassCue` and every other task that a call has registered by then (for others there is
-`vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
-`vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains`, `MazeFirstPerson` and their variants; and the
-paper's finite counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
+Importing this package registers them with Gymnasium:
 
-Gymnasium's time limit truncates their episodes (`gymnasium.make(..., max_episode_steps=100)` chooses another); a step
-after the end is refused. Tasks take the corruption's fields, too: `gymnasium.make("vd4rl_pomdp/WalkerWalk-v0",
-corruption="patch", patch_size=24)`, and `frame_size`, 84 by default.
+- Every task and corruption: `vd4rl_pomdp/WalkerWalk-v0`, `vd4rl_pomdp/WalkerWalk-Patch16-v0`,
+  `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`, `vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`; likewise for `CheetahRun`,
+  `HumanoidWalk`, `ReacherJump`, `PointMassCue` and other tasks registered before the import. For tasks registered
+  later use `vd4rl_pomdp.envs.gym.GymEnv("its_name")`.
+- The mazes: `vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains`, `MazeFirstPerson` and variants.
+- The paper's finite counterexample: `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
+
+Gymnasium's time limit truncates episodes (`gymnasium.make(..., max_episode_steps=100)` changes it); a step after the
+end raises ResetNeeded. Tasks also accept `frame_size` (default 84) and the corruption's fields:
+`gymnasium.make("vd4rl_pomdp/WalkerWalk-v0", corruption="patch", patch_size=24)`.
 """
 
 import re
@@ -23,7 +24,7 @@ from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs.mazes import MAZES
 
 Info = dict[str, Any]
-"""Gymnasium's `info`: what an environment tells besides the observation."""
+"""Gymnasium's `info` dict."""
 _SUFFIXES = {"": "none", "-Patch16": "patch", "-ZeroFrames": "zero_frames", "-Patch16-ZeroFrames": "patch+zero_frames"}
 
 GYM_IDS = {
@@ -31,12 +32,12 @@ GYM_IDS = {
     for task in TASKS.registered()
     for suffix, corruption in _SUFFIXES.items()
 }
-"""Every Gymnasium id, and the task and corruption it names."""
+"""Gymnasium id -> its task and corruption."""
 
 FINITE_IDS = {"vd4rl_pomdp/ForwardJumpCounterexample-v0": "counterexample"}
-"""Finite worlds by Gymnasium id."""
+"""Gymnasium id -> finite world."""
 MAZE_STEPS, FINITE_STEPS = 500, 16
-"""Actions after which an episode in a maze or a finite world is truncated."""
+"""Time limits in actions of mazes and finite worlds."""
 
 
 def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int) -> None:

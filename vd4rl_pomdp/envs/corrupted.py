@@ -1,4 +1,4 @@
-"""The environment a policy meets: stacked frames, corrupted once a step by the class that corrupts the data."""
+"""The evaluation environment: stacked frames, corrupted at every step by the same class that corrupts the data."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corrupti
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.pixels import Render, TimeStep
 
-if hasattr(os, "register_at_fork"):  # a forked process would wait for the threads that it did not inherit
+if hasattr(os, "register_at_fork"):  # a forked child lacks torch's thread pool and would wait for it forever
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What one step shows."""
+    """Observation of one step."""
 
     obs: Tensor
-    """(C, S, S) uint8: the corrupted stack, all the agent may see; (0,) where nothing is drawn."""
+    """(C, S, S) uint8, the corrupted stack, which is all that the agent may see; (0,) without rendering."""
     clean: Tensor
-    """(C, S, S) uint8: the stack before corruption, zeros in place of frames that are not drawn; (0,) without any."""
+    """(C, S, S) uint8, the stack before corruption, with zeros for frames that were not rendered; (0,) without any."""
     time_step: TimeStep
     """Reward, step type and simulator state."""
     key: Tensor
-    """(1,) int64: what the corruption was drawn from, the same for a row of an episode wherever it is played."""
+    """(1,) int64 corruption key; a function of (seed, episode, t), so it is the same on every machine."""
 
 
 _AHEAD = 32
-"""Rows of which it is found out at once whether their frames will be seen."""
+"""Number of rows for which `_seen_from` looks ahead at once."""
 Drawn = Literal["all", "seen", "nothing"]
-"""Which frames are drawn: all, those that an agent will see in any stack, or none."""
+"""Which frames to render: all, only those that will be visible in some stack, or none."""
 
 
 class CorruptedEnv:
-    """A task with stacked, corrupted frames. Row t of an episode is corrupted by keys of (seed, episode, t)."""
+    """A task with stacked, corrupted frames. Row t is corrupted with a key derived from (seed, episode, t)."""
 
     def __init__(
         self,
@@ -60,11 +60,11 @@ class CorruptedEnv:
         self._draws, self._undrawn = draws, np.zeros((3, size, size), np.uint8)
 
     def reset(self, environment_seed: int, corruption_seed: int = 0, episode: int = 0) -> Observation:
-        """Begin an episode; its corruption is drawn from (corruption_seed, episode)."""
+        """Start an episode, whose corruption is determined by (corruption_seed, episode)."""
         self._seed, self._episode, self._t = corruption_seed, episode, 0
         self._choose_whether_to_draw()
         first = self.env.reset(environment_seed)
-        # Pushes out all of the last episode; the first frame stands for those before it, as in `Dataset.stack_rows`.
+        # Fill the whole stack: the first frame is repeated for the missing earlier ones, as in `Dataset.stack_rows`.
         self._frames.extend([self._frame(first)] * FRAME_STACK)
         return self._observation(first)
 
@@ -80,24 +80,24 @@ class CorruptedEnv:
         return self._undrawn if time_step.frame is None else time_step.frame
 
     def _choose_whether_to_draw(self) -> None:
-        """Turn drawing on for frames that will be seen: what is dropped of a stack is known before it is drawn."""
+        """Skip rendering a frame that zero_frames or truncate will drop from every stack; the keys tell in advance."""
         if self._draws == "seen":
             if self._t % _AHEAD == 0:
                 self._seen = self._seen_from(self._t)
             self.env.drawing = self._seen[self._t % _AHEAD]
 
     def _seen_from(self, t: int) -> list[bool]:
-        """Whether the frames of _AHEAD rows will be seen."""
+        """Whether the frame of each row t..t+_AHEAD-1 will be visible in some stack."""
         kept = self._corruption.kept(self._keys(torch.arange(t, t + _AHEAD + FRAME_STACK - 1)), FRAME_STACK)
-        # a frame's place is the newest in its own row's stack, and one less in each that follows
+        # a frame is the newest in its own row's stack, and moves one place back in each following stack
         newest = [(row, FRAME_STACK - 1 - row) for row in range(FRAME_STACK)]
         seen = torch.stack([(kept[row : row + _AHEAD] == place).any(1) for row, place in newest]).any(0).tolist()
-        if t == 0:  # the first fills all places before its own
+        if t == 0:  # the first frame also fills all earlier places of its stack
             seen[0] = any(bool((kept[row] <= place).any()) for row, place in newest)
         return seen
 
     def _keys(self, t: Tensor) -> Tensor:
-        """What (T,) rows are corrupted by: (T,) int64."""
+        """Corruption keys (T,) int64 of rows t (T,)."""
         return derive_keys(self._seed, row_key(torch.full_like(t, self._episode), t))
 
     def _observation(self, time_step: TimeStep) -> Observation:

@@ -1,4 +1,4 @@
-"""dm_control's tasks as V-D4RL saw them: one camera, every action repeated, and the simulator state of every row."""
+"""dm_control's tasks as in V-D4RL: one camera, action repeat, and the simulator state of every row."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vd4rl_pomdp.envs.rendering import mujoco, suite
 
 
 class DMCEnv(PixelEnv):
-    """One task. An episode's rewards replay exactly from its first simulator state."""
+    """One task. Replaying an episode's actions from its first simulator state reproduces the rewards exactly."""
 
     def __init__(
         self, task: DMCTask, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None
@@ -45,13 +45,13 @@ class DMCEnv(PixelEnv):
 
     @property
     def layout(self) -> Layout:
-        """The task's own, else what the model has."""
+        """The layout given by the task, else the one found from the MuJoCo model."""
         return self._layout
 
     def _found_layout(self, camera: int) -> Layout:
-        """Widths of a model; a camera that tracks its subject does not show where it is."""
+        """Derive the layout from the model. Positions that a tracking camera cannot show are marked in it."""
         model = self.physics.model
-        self.simulator.reset()  # an episode of its own: some tasks observe nothing before
+        self.simulator.reset()  # some tasks have no observation before the first reset
         state = flat_state(self.simulator)
         travel, beside = _ground_travel(model, camera)
         turning, quaternions = _free_joints(model)
@@ -60,7 +60,7 @@ class DMCEnv(PixelEnv):
 
     @property
     def rate(self) -> float:
-        """Decisions a second of simulated time."""
+        """Decisions per second of simulated time."""
         return 1 / (self.simulator.control_timestep() * self.task.action_repeat)
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class DMCEnv(PixelEnv):
     def _begin(self, seed: int) -> None:
         self._random.seed(seed)
         self.simulator.reset()
-        # As a replay begins: a reset leaves the solver's warm start of the episode before.
+        # A reset keeps the solver's warm start from the previous episode; clear it, so that replays match.
         start_from(self.simulator, self.physics.get_state())
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
@@ -88,13 +88,13 @@ class DMCEnv(PixelEnv):
 
 
 def flat_state(env: Any) -> np.ndarray:
-    """What dm_control's environment observes as one (D,) float32 vector, in its own order."""
+    """dm_control's observation, flattened in its own order: (D,) float32."""
     observation = env.task.get_observation(env.physics)
     return np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)
 
 
 def observed_states(task: DMCTask, physics: np.ndarray) -> np.ndarray:
-    """What an actor reads in simulator states: (N, P) float64 -> (N, D) float32, as `TimeStep.state`."""
+    """Observations of simulator states: (N, P) float64 -> (N, D) float32, the actor's input `TimeStep.state`."""
     env = _load(task, np.random.RandomState(0))
     env.reset()
     found = []
@@ -105,15 +105,15 @@ def observed_states(task: DMCTask, physics: np.ndarray) -> np.ndarray:
 
 
 def start_from(env: Any, state: np.ndarray) -> None:
-    """Put the simulator into a state with nothing left of what was before, the solver's warm start included."""
+    """Set the simulator's state and clear everything else, including the solver's warm start."""
     with env.physics.reset_context():
         env.physics.set_state(state)
 
 
 def repeat_action(env: Any, action: np.ndarray, repeat: int) -> tuple[float, bool, float]:
-    """Apply one action for the action repeat, or until the task ends; the summed reward, whether it ended, discount.
+    """Repeat an action, or stop when the task ends; returns (summed reward, whether it ended, discount).
 
-    It lies in [-1, 1], which stands for the bounds of the task's own.
+    `action` in [-1, 1] is rescaled to the task's bounds.
     """
     total, bounds = 0.0, env.action_spec()
     rescaled = between(action, bounds.minimum, bounds.maximum)
@@ -126,7 +126,7 @@ def repeat_action(env: Any, action: np.ndarray, repeat: int) -> tuple[float, boo
 
 
 def replay_rewards(task: str, physics: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Rewards of an action sequence from a simulator state.
+    """Replay an action sequence from a simulator state and return the rewards.
 
     Args:
         task: name of a dm_control task.
@@ -145,7 +145,7 @@ def replay_rewards(task: str, physics: np.ndarray, actions: np.ndarray) -> np.nd
 
 
 def replays(task: DMCTask) -> bool:
-    """Whether the simulator state is all that an episode begins with: some tasks draw a target into their model."""
+    """Whether the simulator state determines an episode. False for tasks that randomise the model, such as a target."""
     random = np.random.RandomState(0)
     env = _load(task, random)
     return _model_of_an_episode(env, random, 1) == _model_of_an_episode(env, random, 2)
@@ -161,17 +161,18 @@ def _model_of_an_episode(env: Any, random: np.random.RandomState, seed: int) -> 
 
 
 def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Positions along the ground of the body that a tracking camera follows, x and y of a free joint or level slides.
+    """Position entries that a tracking camera cannot show, since it moves along with its subject.
 
-    Behind them, if it is free, the first positions of the other free bodies. What stands in the world and is followed
-    all the same, such as a hand, shows all places.
+    First the subject's entries along the ground: x and y of a free joint, or horizontal slides. Second, if the subject
+    is free, the first of these entries of each other free body. Both are empty without a tracking camera, or if the
+    subject is fixed to the world, such as a hand.
     """
     if model.cam_mode[camera] not in (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM):
         return (), ()
     on_ground = [list(_ground_positions(model, joint)) for joint in range(model.njnt)]
     moving = {int(model.jnt_bodyid[joint]): kind for joint, kind in enumerate(model.jnt_type) if on_ground[joint]}
     followed = int(model.body_rootid[model.cam_bodyid[camera]])
-    subject = followed or next(iter(moving), 0)  # a camera of the world follows the centre of all that moves
+    subject = followed or next(iter(moving), 0)  # a camera attached to the world follows the centre of all bodies
     travel = [place for joint, places in enumerate(on_ground) if model.jnt_bodyid[joint] == subject for place in places]
     if moving.get(subject) != mujoco.mjtJoint.mjJNT_FREE:
         return tuple(travel), ()
@@ -180,7 +181,7 @@ def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int,
 
 
 def _ground_positions(model: Any, joint: int) -> Iterator[int]:
-    """Positions of a joint along the ground, if its body stands in the world."""
+    """qpos entries of a joint that are positions along the ground, if its body is a child of the world."""
     kind, start, body = model.jnt_type[joint], int(model.jnt_qposadr[joint]), model.jnt_bodyid[joint]
     if model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_FREE:
         yield from (start, start + 1)
@@ -189,23 +190,23 @@ def _ground_positions(model: Any, joint: int) -> Iterator[int]:
 
 
 def _unseen(model: Any) -> tuple[int, ...]:
-    """Positions of bodies that stand in the world and have no shape, nor has any that hangs on them."""
+    """qpos entries of bodies without any geom in their tree, which no camera can show."""
     shown = set(model.body_rootid[model.geom_bodyid].tolist())
     joints = zip(model.body_rootid[model.jnt_bodyid], model.jnt_qposadr, strict=True)
     return tuple(int(start) for root, start in joints if int(root) not in shown)
 
 
 def _free_joints(model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Positions that are angles of hinges without limits, and the first position of every quaternion."""
+    """qpos entries that are angles of unlimited hinges, and the first entry of every quaternion."""
     joints = list(zip(model.jnt_type, model.jnt_qposadr, model.jnt_limited, strict=True))
     turning = [int(start) for kind, start, limited in joints if kind == mujoco.mjtJoint.mjJNT_HINGE and not limited]
-    offset = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}  # a free joint begins with its place
+    offset = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}  # a free joint's qpos starts with x, y, z
     quaternions = [int(start) + offset[kind] for kind, start, _ in joints if kind in offset]
     return tuple(turning), tuple(quaternions)
 
 
 def _load(task: DMCTask, random: np.random.RandomState) -> Any:
-    """The dm_control environment; its own time limit never ends an episode, ours does."""
+    """Load the dm_control environment, without its time limit; PixelEnv applies ours."""
     rendering.check_mujoco()
     arguments = {"random": random, "time_limit": float("inf")}
     if "." in task.domain:
@@ -230,7 +231,7 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
 
 
 def _of_a_module(task: DMCTask) -> Any:
-    """What makes the environment, in a module that is written like one of the suite's."""
+    """Environment factory from a module with a dm_control-like SUITE."""
     try:
         return importlib.import_module(task.domain).SUITE[task.task]
     except (ImportError, AttributeError, KeyError) as error:

@@ -1,14 +1,14 @@
-"""dm_control's reacher and point_mass with a target that is seen in glimpses only, and elsewhere in a later one.
+"""dm_control's reacher and point_mass with a target that is visible only now and then, and may move in between.
 
-- `reacher_jump` (of `reacher easy`): the target is drawn in 3 of every 25 decisions. While it is hidden it may jump: of
-  four glimpses one shows it elsewhere.
-- `point_mass_cue` (of `point_mass easy`): the target is in the centre, as in dm_control, but not drawn. After 10 to 50
-  decisions it is drawn elsewhere, for 10 decisions; there it stays, never to be seen again.
+- `reacher_jump` (from `reacher easy`): the target is visible in 3 of every 25 decisions. While hidden it may jump: at
+  one in four glimpses it is in a new place.
+- `point_mass_cue` (from `point_mass easy`): the target starts in the centre, as in dm_control, but invisible. After 10
+  to 50 decisions it appears elsewhere for 10 decisions; then it stays there and is never visible again.
 
-Neither the first frames and the actions since nor the present frames tell where the target is: a memory of what was
-seen does. State and reward take the target for where it was seen last, so that such a memory knows as much as the
-state. All that an episode depends on is in its simulator state: the target's place and how far aside it is put while
-hidden, and, as positions of a body without a shape, a clock and the number that its random numbers come from.
+Neither the current frames, nor the first frames with all actions since, determine where the target is; only a memory of
+past frames does. State and reward use the place where the target was last seen, so such a memory knows as much as the
+state. The simulator state holds everything that an episode depends on: the target's place, how far it is moved aside
+while hidden, and, as positions of an invisible body, a clock and the seed of the episode's random numbers.
 """
 
 from __future__ import annotations
@@ -22,50 +22,50 @@ from vd4rl_pomdp.core.tasks import ACTION_REPEAT
 from vd4rl_pomdp.envs.rendering import suite
 
 PERIOD, GLIMPSE, JUMPS = 25 * ACTION_REPEAT, 3 * ACTION_REPEAT, 0.25
-"""reacher_jump: steps from one glimpse to the next, steps of a glimpse, and the share of glimpses that show a jump."""
+"""reacher_jump: simulator steps between glimpses, steps per glimpse, and probability of a jump at a glimpse."""
 CUE_BEGINS, CUE = (10 * ACTION_REPEAT, 50 * ACTION_REPEAT), 10 * ACTION_REPEAT
-"""point_mass_cue: bounds of the step that the cue begins with, and its steps."""
+"""point_mass_cue: range of the cue's first simulator step, and its duration in steps."""
 RADII = {"reacher_jump": (0.05, 0.2), "point_mass_cue": (0.12, 0.25)}
-"""Bounds of a target's distance from the centre; reacher_jump's are dm_control's."""
+"""Range of a target's distance from the centre; reacher_jump's is dm_control's."""
 ASIDE = 1.0
-"""How far a hidden target is put aside; pictures end 0.31 from the centre."""
+"""Distance by which a hidden target is moved out of view; frames show up to 0.31 from the centre."""
 _TARGET_SIZE = 0.05
 _TARGET, _HIDDEN, _CLOCK, _PLAN = slice(2, 4), 4, 5, 6
-"""Positions behind those of the task's own two joints."""
+"""qpos entries, after the two of the task's own joints."""
 
 
 class _Glimpsed:
-    """A task whose target is placed and shown by the plan of its episode."""
+    """Mixin for a task whose target is placed, shown and hidden by `plan`."""
 
     random: np.random.RandomState
 
     def initialize_episode(self, physics: Any) -> None:
-        """Draw positions as dm_control does, and the plan."""
+        """Draw initial positions as dm_control does, and the seed of the episode's plan."""
         suite.reacher.randomizers.randomize_limited_and_rotational_joints(physics, self.random)
         physics.data.qpos[_PLAN] = self.random.randint(2**31)
         physics.data.qvel[_CLOCK] = 1.0
         self.plan(physics, 0)
 
     def before_step(self, action: np.ndarray, physics: Any) -> None:
-        """Change the target before the step: no force acts on it, and what the step computes is then of one state."""
-        super().before_step(action, physics)  # type: ignore[misc]  # of the task that it is mixed into
+        """Move the target before the step (no force acts on it), so that the step's results all belong to one state."""
+        super().before_step(action, physics)  # type: ignore[misc]  # the task that this is mixed into
         self.plan(physics, round(physics.data.qpos[_CLOCK] / physics.timestep()) + 1)
 
     def plan(self, physics: Any, step: int) -> None:
-        """Place, show or hide the target as it is after so many steps."""
+        """Set the target's place and visibility for simulator step `step`."""
         raise NotImplementedError
 
     def get_observation(self, physics: Any) -> dict[str, np.ndarray]:
-        """What an actor reads: dm_control's observation, of the task's own joints, and the way to the target."""
+        """The actor's input: dm_control's observation of the task's own joints, and the vector to the target."""
         position, velocity = physics.position()[:2], physics.velocity()[:2]
         return {"position": position, "to_target": physics.to_target(), "velocity": velocity}
 
 
 class ReacherJump(_Glimpsed, suite.reacher.Reacher):
-    """See the module."""
+    """Reacher whose target is shown periodically and may jump while hidden; see the module."""
 
     def plan(self, physics: Any, step: int) -> None:
-        """See `_Glimpsed`."""
+        """Jump with probability JUMPS every PERIOD steps; show the target for the first GLIMPSE of these."""
         if step % PERIOD == 0:
             random = _random(physics, step)
             if step == 0 or random.uniform() < JUMPS:
@@ -73,17 +73,17 @@ class ReacherJump(_Glimpsed, suite.reacher.Reacher):
         physics.data.qpos[_HIDDEN] = 0 if step % PERIOD < GLIMPSE else ASIDE
 
     def get_observation(self, physics: Any) -> dict[str, np.ndarray]:
-        """See `_Glimpsed`; the shoulder, which turns without limits, as cosine and sine."""
+        """As in `_Glimpsed`, with the shoulder's angle, which is unlimited, as cosine and sine."""
         found = super().get_observation(physics)
         shoulder, wrist = found["position"]
         return found | {"position": np.array([np.cos(shoulder), np.sin(shoulder), wrist])}
 
 
 class PointMassCue(_Glimpsed, suite.point_mass.PointMass):
-    """See the module."""
+    """Point mass whose target is shown once, as a cue; see the module."""
 
     def plan(self, physics: Any, step: int) -> None:
-        """See `_Glimpsed`."""
+        """Move the target at the cue's first step; show it during the cue only."""
         first, end = CUE_BEGINS
         begin = first + int(physics.data.qpos[_PLAN]) % (end - first)
         if step == begin:
@@ -115,7 +115,7 @@ class _PointMassPhysics(suite.point_mass.Physics):
 
 
 def _model(domain: Any) -> tuple[bytes, dict[str, bytes]]:
-    """dm_control's model, its target on joints, and a body without a shape that holds clock and plan."""
+    """dm_control's model with the target on joints, and an invisible body whose joints hold clock and seed."""
     xml, assets = domain.get_model_and_assets()
     root = ElementTree.fromstring(xml)
     world: Any = root.find("worldbody")
@@ -126,7 +126,7 @@ def _model(domain: Any) -> tuple[bytes, dict[str, bytes]]:
     target.append(geom)
     hidden = ElementTree.SubElement(world, "body", name="plan")
     ElementTree.SubElement(hidden, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
-    # Level slides, on which no force acts; armature, because two of the target's have one axis.
+    # Frictionless horizontal slides; armature keeps the mass matrix regular, as two of the target's share an axis.
     still = {"type": "slide", "limited": "false", "damping": "0", "armature": "1"}
     for body, name, axis in (
         (target, "target_x", "1 0 0"),

@@ -1,4 +1,4 @@
-"""The corrupted tasks as Gymnasium environments, for use without the rest of the harness."""
+"""The corrupted tasks as Gymnasium environments, usable without the rest of the harness."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from vd4rl_pomdp.envs.pixels import Render, checked_action
 
 
 class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Corrupted pixels in, actions out; only the task itself terminates, and the registered ids add the time limit.
+    """A task with corrupted pixels. Episodes end only if the task terminates; the registered ids add a time limit.
 
     Observations: (9, S, S) uint8, three frames of `frame_size`, oldest first. Actions: (A,) float32 in [-1, 1]. `info`
-    holds `clean`, the observation before corruption, and `physics`, the (P,) float64 simulator state, of width 0 for a
-    task without states. A seed fixes the initial states and corruptions of all episodes that follow it.
-    `corruption_fields` are the corruption's mode and options; one that does not exist or fit raises UserError.
+    holds `clean`, the observation before corruption, and `physics`, the (P,) float64 simulator state (P = 0 for a task
+    without states). `reset(seed=...)` determines the initial states and corruptions of all following episodes.
+    `corruption_fields` are the corruption's mode and options; UserError for an unknown or invalid one.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -39,7 +39,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         refuse_number("frame_size", frame_size, *FRAME_SIZES)
         config = CorruptionConfig.of(corruption, **corruption_fields)
         check_corruption_fits(config, frame_size)
-        # No limit of its own: Gymnasium's wrapper truncates, and tells so.
+        # No time limit here: Gymnasium's TimeLimit wrapper sets `truncated`.
         self._env = CorruptedEnv(TASKS.named(task), config, render, sys.maxsize, frame_size)
         shape = (3 * FRAME_STACK, frame_size, frame_size)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
@@ -51,7 +51,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._frame = np.zeros((frame_size, frame_size, 3), np.uint8)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
-        """Begin the next episode; a seed begins the series anew."""
+        """Start the next episode; a seed restarts the sequence of episodes."""
         super().reset(seed=seed)
         if seed is not None or self._corruption_seed is None:
             self._corruption_seed, self._episode = self._draw(), 0
@@ -60,7 +60,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._show(self._env.reset(self._draw(), self._corruption_seed, self._episode))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action for the action repeat; the reward is the sum. UserError for one of another shape, or NaN."""
+        """Repeat an action; returns the summed reward. UserError if the action has another shape or NaN."""
         now = self._env.step(checked_action(action, self._env.env.action_dim))
         obs, info = self._show(now)
         reward, terminated = now.time_step.reward, now.time_step.terminated
@@ -71,7 +71,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._frame
 
     def close(self) -> None:
-        """Free the simulator and what it draws with; the environment cannot be used any more."""
+        """Free the simulator and its renderer; the environment cannot be used afterwards."""
         self._env.env.close()
 
     def _draw(self) -> int:

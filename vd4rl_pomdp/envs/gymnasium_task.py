@@ -1,4 +1,4 @@
-"""A Gymnasium environment with pixels as a task: its pictures shrunk to frames, its actions in [-1, 1], no states."""
+"""Any Gymnasium environment with pixels as a task: images resized to frames, actions rescaled to [-1, 1], no states."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ NOTHING = np.zeros(0)
 MOST_STEPS_A_SECOND = 1000
 _NUMBERS = (int, float, np.number)
 _REFUSALS = (gymnasium.error.Error, ImportError)
-"""What an environment raises that cannot do what it is asked, for lack of a package or otherwise."""
+"""Errors by which an environment reports that it cannot run, for example without a package."""
 
 
 @cache
 def _overlaps(old: int, new: int) -> np.ndarray:
-    """(new, old) float32: share of each old pixel in each new one, in units that make the sum of a row `old`."""
+    """Resampling weights (new, old) float32: overlap of old and new pixels, scaled to integers with row sum `old`."""
     starts, others = np.arange(new)[:, None] * old, np.arange(old) * new
     return np.maximum(np.minimum(starts + old, others + new) - np.maximum(starts, others), 0).astype(np.float32)
 
 
 def area_means(picture: np.ndarray, size: int) -> np.ndarray:
-    """(H, W, 3) uint8 -> (size, size, 3) uint8, each pixel the mean of the area that it covers, a half rounded up.
+    """Resize by area averaging: (H, W, 3) uint8 -> (size, size, 3) uint8, halves rounded up.
 
-    Where both ratios are whole this is Pillow's box filter, which rounds after each axis. At others that filter takes
-    old pixels whole or not at all, and torch's `area` lets areas overlap; so means are computed here, without an error:
-    all sums are integers below 2^24, or 2^53 along the second axis of pictures of more than 128x128 pixels.
+    For integer ratios this is Pillow's box filter, which rounds after each axis. For others Pillow uses no fractional
+    pixels, and torch's `area` mode lets areas overlap, so the means are computed here. They are exact: all sums are
+    integers below 2^24 (float32), or below 2^53 (float64) for images larger than 128x128.
     """
     height, width, _ = picture.shape
     if not (height % size or width % size):
         return np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
-    exact = np.float32 if height * width <= 2**14 else np.float64  # a half is told from its neighbours, too
+    exact = np.float32 if height * width <= 2**14 else np.float64  # exact even next to a half, where rounding flips
     lines = _overlaps(height, size) @ picture.transpose(2, 0, 1).astype(np.float32, "C")
     sums = lines.astype(exact) @ _overlaps(width, size).T.astype(exact)
     return np.floor(sums / (height * width) + 0.5).astype(np.uint8).transpose(1, 2, 0)
 
 
 class GymnasiumEnv(PixelEnv):
-    """One task. Termination ends an episode with discount 0, truncation and the limit of decisions with discount 1."""
+    """One task. Termination ends an episode with discount 0; truncation and our time limit end it with discount 1."""
 
     def __init__(self, task: GymnasiumTask, size: int | None = FRAME_SIZE, length: int | None = None) -> None:
         super().__init__(task, size, length)
@@ -80,10 +80,11 @@ class GymnasiumEnv(PixelEnv):
 
     @property
     def rate(self) -> float:
-        """Decisions a second of simulated time.
+        """Decisions per second of simulated time.
 
-        The environment's steps take its `dt` or dm_control's `control_timestep()`, where it has one: `render_fps` is
-        what a film of it is to be played at, and shimmy's is no rate. Else it counts, and is 30 where nothing is told.
+        Taken from the environment's `dt` or dm_control's `control_timestep()`, if it has one, else from `render_fps`
+        in its metadata, else 30. `render_fps` is only a fallback: it is a playback rate, and shimmy's is not the true
+        rate.
         """
         for name in ("dt", "control_timestep"):
             step = getattr(self.env.unwrapped, name, None)
@@ -104,7 +105,7 @@ class GymnasiumEnv(PixelEnv):
 
     @contextmanager
     def _telling(self, what: str, refusals: tuple[type[Exception], ...] = _REFUSALS) -> Iterator[None]:
-        """Turn what an environment itself refuses, such as a package or OpenGL that it misses, into a UserError."""
+        """Turn an environment's own errors, such as a missing package or OpenGL, into a UserError."""
         try:
             with gl_errors():
                 yield
@@ -120,7 +121,7 @@ class GymnasiumEnv(PixelEnv):
             with self._telling("cannot be reset"):
                 given = self.env.reset(seed=seed)
         except TypeError as error:
-            if "'seed'" not in str(error):  # of a TypeError from within
+            if "'seed'" not in str(error):  # a TypeError from inside the environment
                 raise
             raise UserError(
                 f"environment {self._name} cannot be reset ({in_one_line(error)}): an episode is its seed's, so give "
@@ -157,22 +158,22 @@ class GymnasiumEnv(PixelEnv):
         return paid
 
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
-        """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""
+        """Rescale an (A,) action from [-1, 1] to the environment's bounds, shape and dtype."""
         low, high = self._space.low, self._space.high
         return between(np.reshape(action, low.shape), low, high)
 
     def _frame(self, size: int) -> np.ndarray:
-        """The present picture as (3, size, size) uint8, each pixel the mean of the area that it covers."""
+        """Current image as (3, size, size) uint8, resized by area averaging."""
         picture = self._picture()
         picture = picture if picture.shape[:2] == (size, size) else area_means(picture, size)
-        return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may draw into its buffer again
+        return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may reuse its buffer
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         frame = self._frame(self.size) if self.size and self.drawing else None
         return TimeStep(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
 
     def _picture(self) -> np.ndarray:
-        """The present picture as (H, W, 3) uint8: a grey one has three equal channels."""
+        """Current image as (H, W, 3) uint8; a grey one is repeated to three channels."""
         shown = self._rendered() if self._renders else self._observation
         picture = shown if isinstance(shown, np.ndarray) else np.zeros(0)
         if picture.ndim == 3 and picture.shape[0] in (1, 3) and picture.shape[-1] not in (1, 3):
@@ -188,9 +189,9 @@ class GymnasiumEnv(PixelEnv):
         return np.repeat(picture, 3, axis=2) if picture.shape[-1] == 1 else picture
 
     def _rendered(self) -> Any:
-        """What `render()` gives, drawn into the environment's own OpenGL context where it is one of MuJoCo's."""
+        """`render()` of the environment; for a MuJoCo environment its OpenGL context is made current first."""
         renderer = getattr(self.env.unwrapped, "mujoco_renderer", None)
-        viewer = getattr(renderer, "viewer", None)  # it exists from the first picture on
+        viewer = getattr(renderer, "viewer", None)  # created at the first render
         if renderer is not None:
             refuse_after_fork()
         with undisturbed(), self._telling("cannot draw its picture"):

@@ -1,4 +1,4 @@
-"""From a task to its environment, and to the widths of what its rows hold."""
+"""Build a task's environment, and look up its layout (dimensions of actions and states)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from vd4rl_pomdp.envs.pixels import PixelEnv, Render, check_render
 
 
 def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None) -> PixelEnv:
-    """The environment of a task.
+    """Build the environment of a task.
 
     Args:
-        task: what is played.
-        render: how dm_control draws.
-        size: height and width S of the frames; None: nothing is drawn.
-        length: decisions after which an episode is cut off; None: the task's own.
+        task: the task.
+        render: rendering mode of dm_control.
+        size: height and width S of the frames; None: no rendering.
+        length: time limit in decisions; None: the task's.
 
     Raises:
-        UserError: the environment cannot be built, or is of a kind that the harness cannot play.
+        UserError: the environment cannot be built, or is of an unsupported kind.
     """
     check_render(render)
     if isinstance(task, GymnasiumTask):
@@ -32,7 +32,7 @@ def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE,
 
 
 def layout_of(task: Task) -> Layout:
-    """A task's layout as given, else as its environment has it, which is built for that once."""
+    """A task's layout; if the task does not state it, its environment is built once to find out."""
     return _found(task) if task.layout is None else task.layout
 
 

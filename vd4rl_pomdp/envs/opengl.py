@@ -1,7 +1,7 @@
-"""What must happen before any environment loads OpenGL, and while it draws; to be imported before whatever may load it.
+"""OpenGL setup and context handling. Import this before any module that may load OpenGL.
 
-One OpenGL context of a process is current, and what draws does not check that it is its own: into another's, or none,
-nothing is drawn, and the picture read is an old one. dm_control, mujoco and Gymnasium know their own contexts alone.
+A process has one current OpenGL context, and renderers do not check that it is theirs: with another's or none current,
+rendering silently returns a stale image. dm_control, mujoco and Gymnasium each track only their own contexts.
 """
 
 import atexit
@@ -18,24 +18,24 @@ from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, first_line
 
-os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows know no other
-os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads
-warnings.filterwarnings("ignore", module="glfw")  # where there is no screen it warns, and what draws then says so
+os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows have only glfw
+os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales with processes, not with threads
+warnings.filterwarnings("ignore", module="glfw")  # it warns if there is no screen; rendering then raises an error
 
-with contextlib.suppress(ImportError):  # not every PyTorch brings it
-    # Triton carries an LLVM of its own. PyTorch's optimisers import it, and the process ends in a segmentation fault
-    # if Mesa's software renderer has loaded another LLVM before.
+with contextlib.suppress(ImportError):  # not every PyTorch build includes Triton
+    # Triton bundles its own LLVM. If PyTorch's optimisers import it after Mesa's software renderer has loaded another
+    # LLVM, the process segfaults, so import it first.
     import triton  # noqa: F401
 
 _LIBRARIES = ("OpenGL.", "glfw.", "mujoco.", "dm_control._render.", "gymnasium.envs.mujoco.mujoco_rendering.")
-"""Modules that load OpenGL or draw with it."""
+"""Prefixes of modules that load or use OpenGL."""
 _VARIABLES = ("MUJOCO_", "PYOPENGL_", "PYGLFW_", "EGL_", "__EGL_", "LIBGL_", "MESA_", "GALLIUM_")
-"""What the environment variables begin with that these and the drivers below them read."""
+"""Prefixes of the environment variables that these modules and the drivers read."""
 
 
 @contextlib.contextmanager
 def gl_errors() -> Iterator[None]:
-    """Turn whatever OpenGL's libraries raise within the block into one line, and let them print nothing beside it."""
+    """Turn any exception raised by OpenGL libraries in the block into a one-line UserError without further output."""
     try:
         yield
     except Exception as error:
@@ -53,7 +53,7 @@ def gl_errors() -> Iterator[None]:
 
 
 def _drop_half_made(error: BaseException) -> None:
-    """Free now what an error's frames hold: contexts that failed while they were made raise again as they are freed."""
+    """Free half-made contexts held by an error's frames now, silencing the errors that their `__del__` raises."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
         cause: BaseException | None = error
@@ -66,11 +66,11 @@ def _drop_half_made(error: BaseException) -> None:
 
 
 _rendered_in: set[int] = set()
-"""Process that has rendered; a forked one inherits its parent's."""
+"""Ids of processes that have rendered; a forked child inherits its parent's."""
 
 
 def refuse_after_fork() -> None:
-    """To be called before rendering: OpenGL waits for ever in a process forked from one that has rendered."""
+    """Call before rendering: raises UserError in a process forked after rendering, where OpenGL would hang."""
     _rendered_in.add(os.getpid())
     if len(_rendered_in) > 1:
         raise UserError(
@@ -80,9 +80,9 @@ def refuse_after_fork() -> None:
 
 
 def keep_display() -> None:
-    """Leave closing the EGL display to the process's end; to be called once dm_control or mujoco has opened it.
+    """Call after dm_control or mujoco has opened the EGL display: removes their exit handler, which closes it.
 
-    They share it, and the exit handler of either would close it while others still free their contexts.
+    They share the display, and closing it early breaks contexts that others still have to free.
     """
     if os.environ["MUJOCO_GL"] == "egl":
         from OpenGL import EGL  # type: ignore[import-untyped]
@@ -91,7 +91,7 @@ def keep_display() -> None:
 
 
 def close_at_exit(drawing: Any) -> None:
-    """To be called with what has made a context by mujoco's own means: it is closed before OpenGL itself ends."""
+    """Close `drawing`, a renderer with a context made by mujoco, at exit, before OpenGL itself is shut down."""
     keep_display()
     atexit.register(_close, weakref.ref(drawing))
 
@@ -104,9 +104,9 @@ def _close(drawing: weakref.ref[Any]) -> None:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Hold the garbage collector back, to be entered before OpenGL is told where to draw.
+    """Disable garbage collection while rendering; enter it before making a context current.
 
-    An environment that it frees takes its context along and leaves none current.
+    Otherwise the collector may free another environment's context, which leaves no context current.
     """
     enabled = gc.isenabled()
     gc.disable()

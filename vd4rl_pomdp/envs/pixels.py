@@ -1,4 +1,4 @@
-"""What the harness does with any task: begin an episode, act, read a time step."""
+"""Interface of all tasks: `PixelEnv` with reset and step, and `TimeStep`."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from vd4rl_pomdp.core.tasks import Layout, Task
 from vd4rl_pomdp.core.types import StepType
 
 Render = Literal["fast", "exact"]
-"""How dm_control draws: fast, with a smaller shadow map, or exact."""
+"""Rendering mode of dm_control: "fast" uses a smaller shadow map than "exact"."""
 
 
 def check_render(render: str) -> None:
-    """Raise UserError for a word that names no rendering."""
+    """Raise UserError for an unknown rendering mode."""
     refuse_unknown("rendering", render, get_args(Render))
 
 
 @dataclass(frozen=True)
 class TimeStep:
-    """What an environment returns at one step: a row of a set without its action (see the axis in `types`)."""
+    """An environment's output at one step: a row of a data set without its action (see `core.types`)."""
 
     frame: np.ndarray | None
-    """(3, S, S) uint8; None when drawing is off."""
+    """(3, S, S) uint8; None if rendering is off."""
     state: np.ndarray
-    """(D,) float32: dm_control's observations, flattened in their own order; (0,) for a task without states."""
+    """(D,) float32, dm_control's observations, flattened in their own order; (0,) for a task without states."""
     physics: np.ndarray
-    """(P,) float64: simulator state; (0,) for a task without states."""
+    """(P,) float64 simulator state; (0,) for a task without states."""
     reward: float
-    """Reward that led into this time step, summed over the action repeat; 0 in the first."""
+    """Reward of the action that led here, summed over the action repeat; 0 at the first step."""
     discount: float
-    """0 in a last time step that the task itself ended, else 1."""
+    """0 if the task terminated here, else 1."""
     step_type: StepType
 
     @property
@@ -47,14 +47,14 @@ class TimeStep:
 
     @property
     def terminated(self) -> bool:
-        """Whether the task itself ended the episode here, and not a limit of time."""
+        """Whether the task terminated here, as opposed to a time limit."""
         return self.last and self.discount == 0
 
 
 def check_bounds(what: str, low: np.ndarray, high: np.ndarray) -> None:
-    """Raise UserError for bounds of actions, arrays of one shape, that are infinite or so wide that they bound nothing.
+    """Raise UserError for action bounds, arrays of the same shape, that are infinite or too large to rescale to.
 
-    dm_control gives MuJoCo's largest number, 1e10, as the bounds of motors without limits.
+    For unlimited motors dm_control reports MuJoCo's largest number, 1e10, as bounds.
     """
     least, most = low.astype(np.float64), high.astype(np.float64)  # float16 does not hold 1e9
     if not ((least >= -MOST) & (least <= most) & (most <= MOST)).all():
@@ -65,9 +65,9 @@ def check_bounds(what: str, low: np.ndarray, high: np.ndarray) -> None:
 
 
 def between(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """An action in [-1, 1] between the bounds of an environment's own, in their dtype; what lies outside is cut off.
+    """Clip an action to [-1, 1] and rescale it to [low, high], in their dtype.
 
-    -1 and 1 become the bounds themselves, which rounded sums miss: between 1.5 and 1.86, 1 would be 1.8600000000000003.
+    -1 and 1 map to the bounds exactly, which rounding would miss: for [1.5, 1.86], 1 would give 1.8600000000000003.
     """
     wide = np.result_type(low, np.float64)
     lowest, highest, within = low.astype(wide), high.astype(wide), np.clip(action, -1, 1)
@@ -76,7 +76,7 @@ def between(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
 
 
 def checked_action(action: Any, dimensions: int) -> np.ndarray:
-    """A caller's action as an array; UserError for one that is not (A,) numbers."""
+    """A caller's action as an array; UserError unless it is (A,) finite numbers."""
     found = np.asarray(action)
     if found.shape != (dimensions,) or not np.isfinite(found).all():
         raise UserError(f"the action {action!r} is not one of {dimensions} finite numbers, of shape ({dimensions},)")
@@ -84,19 +84,19 @@ def checked_action(action: Any, dimensions: int) -> np.ndarray:
 
 
 class PixelEnv(ABC):
-    """One task. An episode's first state depends on its seed alone."""
+    """One task. An episode's first state depends only on its seed."""
 
     def __init__(self, task: Task, size: int | None, length: int | None) -> None:
-        """See the class.
+        """Initialise.
 
         Args:
-            task: what is played.
-            size: height and width S of the frames; None: nothing is drawn.
-            length: decisions after which an episode is cut off; None: the task's own.
+            task: the task.
+            size: height and width S of the frames; None: no rendering.
+            length: time limit in decisions; None: the task's.
         """
         self.task, self.size = task, size
         self.drawing = size is not None
-        """Whether the next time steps have a frame; it can be turned off and on where there is a size."""
+        """Whether to render the next time steps; may be switched at any time if `size` is given."""
         self._length = task.decisions if length is None else length
         if self._length < 1:
             raise UserError(f"an episode of {self._length} decisions is too short; it needs at least 1")
@@ -105,12 +105,12 @@ class PixelEnv(ABC):
     @property
     @abstractmethod
     def layout(self) -> Layout:
-        """Widths of the rows."""
+        """Dimensions of actions and states."""
 
     @property
     @abstractmethod
     def rate(self) -> float:
-        """Decisions a second of simulated time."""
+        """Decisions per second of simulated time."""
 
     @property
     def action_dim(self) -> int:
@@ -118,13 +118,13 @@ class PixelEnv(ABC):
         return self.layout.action_dim
 
     def reset(self, seed: int) -> TimeStep:
-        """Begin the episode of a seed."""
+        """Start an episode; the seed determines its first state."""
         self._begin(seed)
         self._decisions, self._over = 0, False
         return self._time_step(0.0, 1.0, StepType.FIRST)
 
     def step(self, action: np.ndarray) -> TimeStep:
-        """Apply an (A,) float32 action in [-1, 1] for the action repeat; UserError where no episode goes on."""
+        """Repeat an (A,) float32 action in [-1, 1]; UserError if no episode is running."""
         if self._over:
             raise UserError("no episode has begun, or it is over: call reset() before the next step()")
         reward, ended, discount = self._apply(action)
@@ -134,19 +134,19 @@ class PixelEnv(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free the simulator and what it draws with."""
+        """Free the simulator and its renderer."""
 
     @abstractmethod
     def _begin(self, seed: int) -> None:
-        """Put the environment into the first state of a seed's episode."""
+        """Reset to the first state of the seed's episode."""
 
     @abstractmethod
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
-        """Repeat an action, no further than the episode goes; summed reward, whether the episode ended, discount."""
+        """Repeat an action until the episode ends; returns (summed reward, whether it ended, discount)."""
 
     @abstractmethod
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
-        """The time step of the present state."""
+        """Time step of the current state."""
 
 
 class ResetAfterEnd(gymnasium.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
@@ -158,7 +158,7 @@ class ResetAfterEnd(gymnasium.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordC
         self._over = False
 
     def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin the next episode."""
+        """Start the next episode."""
         self._over = False
         return self.env.reset(**options)
 

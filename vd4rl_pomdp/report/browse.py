@@ -39,8 +39,7 @@ _MARK = b"<title>vd4rl-pomdp data view"
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(StageConfig):
-    """Write a dataset's episodes as one HTML page, clean and corrupted. Put --corruption before --help to see its
-    options."""
+    """Write a dataset as one HTML page, clean and corrupted. For its options, put --corruption before --help."""
 
     data: tyro.conf.Positional[Path] = Path()
     """Folder of shards."""

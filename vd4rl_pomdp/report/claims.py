@@ -108,12 +108,12 @@ CLAIMS = (
 def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
     """One row with a `verdict` per claim and setting in which both sides have finished runs.
 
-    `difference` is the left side's mean return minus the right's, `low` and `high` its 95% interval, `p` its
-    two-sided p value; columns with `clean_` are the same without corruption. A claim of a family is judged by
-    `adjusted_p`, an exploratory one by `p`. `smallest` is the difference that a 5% test with this standard error
-    detects with 80% power; `smallest_share` is the same as a fraction of the data's return. If the sides have no
-    runs with equal settings, these are None and the verdict names the differences. Nothing is judged unless the
-    critics of both sides are known to have converged.
+    `difference` is the left side's mean return minus the right's, `low` and `high` its 95% interval, `p` its two-sided
+    p value; columns with `clean_` are the same without corruption. A claim of a family is judged by `adjusted_p`, an
+    exploratory one by `p`. `smallest` is the difference that a 5% test with this standard error detects with 80% power;
+    `smallest_share` is the same as a fraction of the data's return. If the sides have no runs with equal settings,
+    these are None and the verdict names the differences. Nothing is judged unless the critics of both sides are known
+    to have converged.
 
     Args:
         runs: of a report.
@@ -170,8 +170,8 @@ def _row(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tuple[R
 def _decisive(left: list[Run], others: list[Run]) -> Sides:
     """The comparison that decides a claim about every other method, since it must hold against each of them.
 
-    Among other methods and variants: the one with the highest return of those that refute the claim, else of those
-    that leave it open, however few seeds they have.
+    Among other methods and variants: the one with the highest return of those that refute the claim, else of those that
+    leave it open, however few seeds they have.
     """
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
     alike = [pair for pair in pairs if not pair.unlike]
@@ -226,13 +226,12 @@ OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}
 def leads(runs: list[Run]) -> list[Row]:
     """One row per setting, policy budget, difference and pretraining budget.
 
-    Only where both methods have at least two pretraining budgets, with a run each. `difference` is the leader's
-    mean return minus the other method's, each run's in % of its own data's mean return; `low` and `high` bound its
-    95% interval over seeds and episodes. Only runs with equal settings are compared; without any it is None.
-    `left_seeds` and `right_seeds` count both sides' seeds, comparable or not.
+    Only where both methods have at least two pretraining budgets, with a run each. `difference` is the leader's mean
+    return minus the other method's, each run's in % of its own data's mean return; `low` and `high` bound its 95%
+    interval over seeds and episodes. Only runs with equal settings are compared; without any it is None. `left_seeds`
+    and `right_seeds` count both sides' seeds, comparable or not.
 
-    A policy's budget is its `updates` and hidden `units`; a pretraining's is its `steps` and frame `stacks` per
-    batch.
+    A policy's budget is its `updates` and hidden `units`; a pretraining's is its `steps` and frame `stacks` per batch.
     """
     finished = [run for run in comparable(runs) if (run.reference.data_return or 0) > 0]
     sides_of = [as_it_is(LEADER, finished), *(as_it_is(OTHER, finished, history) for history in OTHERS.values())]

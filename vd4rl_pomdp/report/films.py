@@ -38,8 +38,8 @@ def read_film(path: Path) -> Film:
 def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:
     """The first seed's film for every method and setting, and the number of films that did not fit.
 
-    Keys: `title`; `strip` (PNG) and `movie` (animated WebP), both in base64; `share`, the strip's fraction of the
-        page width; `total`, the episode's return.
+    Keys: `title`; `strip` (PNG) and `movie` (animated WebP), both in base64; `share`, the strip's fraction of the page
+    width; `total`, the episode's return.
     """
     chosen: dict[tuple, Run] = {}
     for run in runs:

@@ -1,7 +1,7 @@
 """Gates that a setting must pass before its methods are ranked.
 
 1. The data must suffice for the algorithm, both with the state known (`state`) and with nothing hidden (`acro` under
-`none`, relative to published results from pixels).
+   `none`, relative to published results from pixels).
 2. Under the corruption, some method must beat an untrained encoder (`random`).
 3. The critics of all these runs must have converged.
 
@@ -61,10 +61,10 @@ def gates(runs: list[Run]) -> list[Row]:
     """One row with a `verdict` per task, quality, corruption and algorithm with finished runs of frozen encoders.
 
     `data_return` is a mean over the datasets of its runs. `state_share`, `acro_share` and `best_share` (of the best
-    method) are fractions of the data's return; `state_seeds` and `acro_seeds` count the runs behind them.
-    `acro_bar` is the minimum for `acro_share`, and `bar_from` the published score behind it. `above_random` is the
-    mean return of the best method minus that of `random`, chosen by `sides`; `low` and `high` bound its 95%
-    interval. `converged` says whether the critics of all these runs did. Unknown values are None.
+    method) are fractions of the data's return; `state_seeds` and `acro_seeds` count the runs behind them. `acro_bar` is
+    the minimum for `acro_share`, and `bar_from` the published score behind it. `above_random` is the mean return of the
+    best method minus that of `random`, chosen by `sides`; `low` and `high` bound its 95% interval. `converged` says
+    whether the critics of all these runs did. Unknown values are None.
     """
     finished = comparable(runs)
     return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
@@ -181,8 +181,7 @@ def converged(runs: Iterable[Run]) -> bool | None:
 
 
 def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
-    """Runs under a corruption. Missing seeds of `state` are taken from other corruptions, since nothing is hidden from
-    it."""
+    """Runs under a corruption, with missing seeds of `state` from other corruptions: nothing is hidden from it."""
     # The setting's own runs first, so that a seed of `state` under two corruptions counts once.
     found: dict[tuple[str, ...], Run] = {}
     for run in sorted(runs, key=lambda run: run.labels["corruption"] != corruption):
@@ -253,16 +252,15 @@ def returns_of(runs: list[Run]) -> np.ndarray:
 
 
 def episodes_of(runs: list[Run], clean: bool = False) -> np.ndarray:
-    """Returns of the episodes of each run's last evaluation, or with `clean` of that without corruption, (n,
-    episodes)."""
+    """Episode returns of each run's last evaluation, or with `clean` of the uncorrupted one, (n, episodes)."""
     return stats.by_episode([[row["return"] for row in (run.last_clean if clean else run.last)] for run in runs])
 
 
 def difference(compared: Sides, clean: bool = False) -> tuple[float | None, tuple[float | None, float | None]]:
     """Mean return of the left side minus that of the right, and its 95% interval over seeds and episodes.
 
-    None if a side has no run, if settings differ or, with `clean`, if a policy was not evaluated without
-    corruption. The interval is None if `stats.difference_interval` has none.
+    None if a side has no run, if settings differ or, with `clean`, if a policy was not evaluated without corruption.
+    The interval is None if `stats.difference_interval` has none.
     """
     everyone = [*compared.left, *compared.right]
     if not compared.left or compared.unlike or (clean and not all(run.last_clean for run in everyone)):

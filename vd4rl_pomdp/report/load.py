@@ -341,13 +341,12 @@ def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, An
 
 
 def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
-    """Drop settings that vary with the dataset only, e.g. a budget per task: equal within each dataset, different
-    across.
+    """Drop settings that only vary with the dataset (equal within each, not across), e.g. a budget per task.
 
-        Args:
-            settings: of every run.
-            sets: task and quality of every run.
-            alike: grouping key of every run; groups are treated separately.
+    Args:
+        settings: of every run.
+        sets: task and quality of every run.
+        alike: grouping key of every run; groups are treated separately.
     """
     # A per-task budget is no ablation. As a variant it would split a method in two, with gaps on every other task.
     kept = [dict(one) for one in settings]
@@ -362,8 +361,7 @@ def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Seque
 
 
 def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list[str]:
-    """For each run, in words, the settings that differ within its group `alike`; "" for runs without recorded
-    settings."""
+    """Per run, in words, the settings that differ within its group `alike`; "" without recorded settings."""
     words = [""] * len(settings)
     for places in groups((i for i, own in enumerate(settings) if own), alike.__getitem__).values():
         for i, told in zip(places, _differences([settings[i] for i in places]), strict=True):
@@ -374,8 +372,8 @@ def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list
 def _differences(settings: Sequence[Settings]) -> list[str]:
     """Per run, in words, the settings that differ among some runs: "max_k 1, steps 20". Values in PLAIN are omitted.
 
-    ENCODER_SEED is always shown, since nothing else reveals that seeds share an encoder. A preset replaces the
-    settings that it determines.
+    ENCODER_SEED is always shown, since nothing else reveals that seeds share an encoder. A preset replaces the settings
+    that it determines.
     """
     names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
     columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in settings] for name in names}
@@ -401,11 +399,10 @@ def _decided(name: str, columns: Mapping[str, list[str]], by: Sequence[str]) -> 
 
 
 def a_set_a_seed(runs: Sequence[Run]) -> bool:
-    """Whether there are several training seeds, each with its own dataset, collected alike except for the collection
-    seed.
+    """Whether several training seeds each have their own dataset, alike except for the collection seed.
 
-        Then datasets vary like seeds, and these runs count as seeds of one method. If one training seed has two
-        contents, or one collection seed has, they are different experiments.
+    Then datasets vary like seeds, and these runs count as seeds of one method. If one training seed has two contents,
+    or one collection seed has, they are different experiments.
     """
     plans = [run.record.get("collection") or {} for run in runs]
     contents = [run.record.get("inputs", {}).get("data") for run in runs]
@@ -463,8 +460,8 @@ def _run_row(run: Run) -> Row:
 def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
     """One row per missing or unfinished run: CONDITION, seed and `state`.
 
-    In each setting, every method of the report is expected with all its variants, for every seed that any run has
-    in that setting; also whatever the choice asks for there.
+    In each setting, every method of the report is expected with all its variants, for every seed that any run has in
+    that setting; also whatever the choice asks for there.
     """
     grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
     rows = []
@@ -495,8 +492,8 @@ def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
 def _expected(mine: list[Run], setting: tuple[str, ...]) -> Iterator[str]:
     """Variants of a method expected in a setting: all variants of any setting that shares one with it.
 
-    If every setting has its own variants, e.g. a budget per task, nothing is missing. Nor is `state` if it ran on
-    the same dataset under another corruption. Variants by data are expected only where they occur.
+    If every setting has its own variants, e.g. a budget per task, nothing is missing. Nor is `state` if it ran on the
+    same dataset under another corruption. Variants by data are expected only where they occur.
     """
     by_setting = groups(mine, lambda run: run.of(SETTING))
     here = by_setting.get(setting, [])

@@ -65,12 +65,12 @@ class Report(NamedTuple):
 def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     """Write a report of the runs at or below `paths` into `out`; `choice` narrows them.
 
-    The folder is also a results folder, so the report can be rebuilt from it alone. A study that `vd4rl-pomdp
-    theory` wrote at or below `paths` becomes a section of the page.
+    The folder is also a results folder, so the report can be rebuilt from it alone. A study that `vd4rl-pomdp theory`
+    wrote at or below `paths` becomes a section of the page.
 
     Raises:
-        UserError: there is nothing to report, a file is damaged, or `out` holds something else or finished runs
-            that this report lacks.
+        UserError: there is nothing to report, a file is damaged, or `out` holds something else or finished runs that
+            this report lacks.
     """
     refuse_foreign(out, "report", f"{MARK}.csv", RUNS)
     runs = load_runs(paths, out, choice)

@@ -68,12 +68,11 @@ def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarra
 
 
 def probability_of_improvement(strata: Strata, others: Strata) -> float:
-    """Probability that a random run beats a random run of the others on the same task, averaged over tasks; ties count
-    half.
+    """Probability that a run beats a run of the others on the same task, averaged over tasks; ties count half.
 
-        Args:
-            strata: scores of one method, by task.
-            others: scores of another method on the same tasks, in the same order.
+    Args:
+        strata: scores of one method, by task.
+        others: scores of another method on the same tasks, in the same order.
     """
     return float(np.mean([_wins(one, other).mean() for one, other in zip(strata, others, strict=True)]))
 
@@ -122,8 +121,8 @@ def mean_interval(scores: np.ndarray) -> Interval | None:
     """95% t interval of the mean of (seeds, episodes) scores, over the seeds and the episodes that they share.
 
     Three seeds that happen to agree must not make the interval narrower than the episodes allow. So the squared
-    standard errors of both levels are added, with Welch-Satterthwaite degrees of freedom. This approximates a
-    bootstrap of seeds and then episodes, corrected for few seeds.
+    standard errors of both levels are added, with Welch-Satterthwaite degrees of freedom. This approximates a bootstrap
+    of seeds and then episodes, corrected for few seeds.
 
     Returns:
         Lower and upper end; None for a single seed, or if all scores are equal, since that says nothing about the
@@ -211,8 +210,7 @@ def improvement_interval(
 def profile_band(
     strata: Strata, thresholds: np.ndarray, rng: np.random.Generator, replicates: int = REPLICATES
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pointwise 95% percentile band of the performance profile of all runs, two (k,) arrays; None if a task has a
-    single seed."""
+    """Pointwise 95% band of the performance profile of all runs, two (k,) arrays; None if a task has one seed."""
     if _single(strata):
         return None
     runs = sum(map(len, strata))

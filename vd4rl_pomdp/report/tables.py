@@ -126,8 +126,8 @@ def _strata(finals: pd.DataFrame) -> stats.Strata:
 def aggregate(evaluated: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
     """AGGREGATES over the tasks and qualities of every method and corruption, with stratified 95% intervals.
 
-    `of_tasks` is the number of tasks and qualities under the corruption. A row with fewer `tasks` is not comparable
-    and goes below the others. `seeds` is the minimum over tasks. A method without runs has no numbers.
+    `of_tasks` is the number of tasks and qualities under the corruption. A row with fewer `tasks` is not comparable and
+    goes below the others. `seeds` is the minimum over tasks. A method without runs has no numbers.
     """
     finals = final_scores(evaluated)
     everything = pd.concat([finals[list(CONDITION)], gaps[list(CONDITION)]])
@@ -238,8 +238,7 @@ def _means(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
 
 
 def costs(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean, minimum and maximum seconds of both stages by method, over all finished runs of a table, and their
-    machines."""
+    """Mean, minimum and maximum seconds of both stages by method, over all finished runs, and their machines."""
     finished = table[table["score"].notna()]
     grouped = finished.assign(method=labels(finished)).groupby("method", sort=False)
     spans = {
@@ -282,8 +281,8 @@ def elsewhere(episodes: pd.DataFrame) -> pd.DataFrame:
 def critics(table: pd.DataFrame) -> pd.DataFrame:
     """Critic values of every condition and the data's own discounted return: means over finished seeds.
 
-    `critic_moved` is the mean absolute drift, `converged` the number of converged critics; both are missing if any
-    seed lacks the value. Algorithms without a critic have no row.
+    `critic_moved` is the mean absolute drift, `converged` the number of converged critics; both are missing if any seed
+    lacks the value. Algorithms without a critic have no row.
     """
     known = table["critic_value"].notna() | table["converged"].isna()
     mine = table[table["score"].notna() & known]
@@ -292,11 +291,10 @@ def critics(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:
-    """Mean action loss over the pretraining runs of every condition, at up to POINTS of the steps that all of them
-    logged.
+    """Mean action loss over pretraining runs of every condition, at up to POINTS steps that all runs logged.
 
-        Args:
-            curves: IDENTITY of each finished pretraining, and its losses by step.
+    Args:
+        curves: IDENTITY of each finished pretraining, and its losses by step.
     """
     rows = [named | {"step": step, "action_loss": loss} for named, told in curves for step, loss in told]
     parts = [pd.DataFrame(columns=[*CONDITION, "step", "action_loss", "seeds"])]

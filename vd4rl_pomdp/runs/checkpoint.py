@@ -42,11 +42,10 @@ class Checkpoints:
             self.prune(KEPT)
 
     def restore(self, take: Callable[[State], None]) -> float | None:
-        """Pass the newest undamaged state to `take`. Return the run's seconds at that point, or None without
-        checkpoints.
+        """Pass the newest undamaged state to `take`; return the run's seconds then, or None without checkpoints.
 
-                Raises:
-                    UserError: all checkpoints are damaged or unreadable, or belong to another format or run.
+        Raises:
+            UserError: all checkpoints are damaged or unreadable, or belong to another format or run.
         """
         # Disks corrupt files; falling back to the previous checkpoint beats starting over.
         damaged: dict[Path, str] = {}

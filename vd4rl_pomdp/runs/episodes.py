@@ -23,11 +23,10 @@ COLUMNS = (
 
 
 def append_episodes(path: Path, rows: list[Row]) -> None:
-    """Append rows to an `episodes.csv`, creating it with a header if needed. Without rows, this checks that it is
-    writable.
+    """Append rows to an `episodes.csv`, created with a header if needed. No rows: check that it is writable.
 
-        Raises:
-            UserError: the file cannot be written, is of another kind, or is damaged. It is left unchanged.
+    Raises:
+        UserError: the file cannot be written, is of another kind, or is damaged. It is left unchanged.
     """
     there = read_episodes(path)
     with appending(path) as file:
@@ -38,11 +37,10 @@ def append_episodes(path: Path, rows: list[Row]) -> None:
 
 
 def read_episodes(path: Path) -> list[Row]:
-    """Rows of an `episodes.csv`, with numeric columns parsed and others left as text; empty if the file is missing or
-    empty.
+    """Rows of an `episodes.csv` with numbers parsed, others left as text; none if it is missing or empty.
 
-        Raises:
-            UserError: the file was not written by this package, or is damaged.
+    Raises:
+        UserError: the file was not written by this package, or is damaged.
     """
     if not regular(path).is_file():
         return []

@@ -77,8 +77,8 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 
     Args:
         path: the file.
-        shared: whether other processes may write it at the same time. Each then uses its own temporary name, which
-            is left behind if the process is killed.
+        shared: whether other processes may write it at the same time. Each then uses its own temporary name, which is
+            left behind if the process is killed.
 
     Raises:
         UserError: the disk is full, or the system refuses for another reason.
@@ -97,13 +97,12 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[IO[str]]:
-    """Open a text file for appending; its lines are flushed to disk when the block ends, since a checkpoint may rely on
-    them.
+    """Append to a text file, flushed to disk when the block ends since checkpoints rely on it.
 
-        Concurrent writers wait for each other where the file system supports locks.
+    Concurrent writers wait for each other where the file system supports locks.
 
-        Raises:
-            UserError: the system refuses.
+    Raises:
+        UserError: the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
         with suppress(OSError):  # some file systems have no locks

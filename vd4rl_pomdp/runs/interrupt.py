@@ -41,9 +41,8 @@ def handled(second: signal.Handlers | None = None) -> Iterator[None]:
     Does nothing when nested or outside the main thread.
 
     Args:
-        second: action for a second signal. SIG_DFL, used on the command line, kills the process even inside a
-            library's C code. SIG_IGN is for processes whose parent will kill them itself. None keeps the previous
-            handler.
+        second: action for a second signal. SIG_DFL, used on the command line, kills the process even inside a library's
+            C code. SIG_IGN is for processes whose parent will kill them itself. None keeps the previous handler.
     """
     if _Signals.handled or threading.current_thread() is not threading.main_thread():
         yield
@@ -74,8 +73,7 @@ def handled(second: signal.Handlers | None = None) -> Iterator[None]:
 
 @contextmanager
 def deferred(value: bool = True) -> Iterator[None]:
-    """Within the block, signals wait for the next `check`, at the latest the one at its end. False: handle them at
-    once."""
+    """Within the block, signals wait for the next `check`, at latest at its end. False: handle them at once."""
     before, _Signals.deferred = _Signals.deferred, value
     try:
         if not value:

@@ -45,8 +45,7 @@ class Loop:
         self._saved = learner.step
 
     def __iter__(self) -> Iterator[int]:
-        """Yield each step's number for the body to do. Afterwards saves a checkpoint if one is due or a signal
-        arrived."""
+        """Yield each step's number; after the body, save a checkpoint if one is due or a signal arrived."""
         return in_step([self], self._total)
 
     def due(self, every: int) -> bool:

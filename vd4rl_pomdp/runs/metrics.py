@@ -107,8 +107,7 @@ class Mirror(Protocol):
 class MetricsLog:
     """Appends rows {"step": int, name: number, ...} to metrics.jsonl and its mirrors.
 
-    Reopening it at a checkpoint drops later rows, and evaluations at the checkpoint's own step, which will be
-    repeated.
+    Reopening it at a checkpoint drops later rows, and evaluations at the checkpoint's own step, which will be repeated.
     """
 
     def __init__(

@@ -48,8 +48,7 @@ class Replay:
             step: does the step of a turn, 0 to period - 1. Returns scalars, or one-element-per-run tensors.
             device: device of the step.
             streams: all random streams that it uses.
-            period: steps after which the Python control flow repeats, e.g. 2 if every second step trains the
-                actor.
+            period: steps after which the Python control flow repeats, e.g. 2 if every second step trains the actor.
             trained: objects that the step changes; replay requires that Python numbers in them stay constant.
             capture: how to capture; None: CUDA graphs on a GPU, nothing elsewhere.
         """
@@ -162,8 +161,8 @@ class CudaCapture:
 def python_state(objects: Sequence[Any]) -> dict[str, Any]:
     """Values in the attributes of objects, and of modules and optimisers in them, by name.
 
-    Numbers and strings by value, tensors by identity: replacing a tensor counts as a change, because a replayed
-    step would not see it; writing into one does not.
+    Numbers and strings by value, tensors by identity: replacing a tensor counts as a change, because a replayed step
+    would not see it; writing into one does not.
     """
     found: dict[str, Any] = {}
     seen: set[int] = set()

@@ -103,8 +103,7 @@ class Result:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """Its encoder's record of the code that made it; earlier rows keep it in a separate part. Empty without an
-        encoder."""
+        """Its encoder's record of its code, in earlier rows a separate part; empty without an encoder."""
         told = self.files.get("encoder", {})
         return told.get("origin", told)
 
@@ -294,8 +293,7 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
         but: a results folder to skip unless it is in `paths`.
 
     Raises:
-        UserError: a path is missing, there is no run, two runs with one id have different rows, or a file is
-            damaged.
+        UserError: a path is missing, there is no run, two runs with one id have different rows, or a file is damaged.
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
@@ -416,8 +414,8 @@ def _kept(out: Path) -> dict[str, Result]:
 def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
     """The runs of a results folder, and a sentence for each contradiction with their own records.
 
-    Ids must match the recorded settings, seed, data and format. Episodes must be exactly those that the settings
-    ask for, with the run's labels; environment seeds must match episode numbers, and scores their returns.
+    Ids must match the recorded settings, seed, data and format. Episodes must be exactly those that the settings ask
+    for, with the run's labels; environment seeds must match episode numbers, and scores their returns.
 
     Raises:
         UserError: as `read_results`.

@@ -84,8 +84,8 @@ class RunFolder:
             words: the run's own command, if the command line starts several runs.
 
         Raises:
-            UserError: the folder holds something else, a run with other settings, inputs or format, or a
-                finished run that lost a result.
+            UserError: the folder holds something else, a run with other settings, inputs or format, or a finished run
+                that lost a result.
         """
         self.path = path
         self.config: dict[str, Any] = jsonable(flat(config))

@@ -80,8 +80,8 @@ def _close_kept() -> None:
 def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     """Yield function(job) for every job, in order.
 
-    Workers are fresh single-threaded processes that inherit no GL context or thread pool; under `kept_workers` they
-    may be reused. With one worker, everything runs in the calling process. 0 means one worker per core.
+    Workers are fresh single-threaded processes that inherit no GL context or thread pool; under `kept_workers` they may
+    be reused. With one worker, everything runs in the calling process. 0 means one worker per core.
 
     Raises:
         UserError: a worker died, or a job cannot be pickled. Exceptions of jobs are re-raised here.

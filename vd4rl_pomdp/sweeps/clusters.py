@@ -113,8 +113,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
 
 
 class SlurmCluster:
-    """A sweep's tasks as Slurm job arrays, submitted by submitit and found in the queue by a name hashed from the
-    folder."""
+    """A sweep's tasks as Slurm job arrays, submitted by submitit under a job name hashed from the folder."""
 
     def __init__(self, options: SlurmOptions, folder: Path) -> None:
         """Check that submitit and Slurm's commands are installed, or raise UserError. Slurm is not contacted yet.
@@ -165,8 +164,7 @@ class SlurmCluster:
             print(f"warning: {error}; tasks may be left: scancel --me --name={self._name}", file=sys.stderr)
 
     def _ask(self, command: str, *words: str) -> str:
-        """Run a Slurm command on this sweep's tasks and return its stdout; UnavailableError if it fails or times
-        out."""
+        """Stdout of a Slurm command on this sweep's tasks; UnavailableError if it fails or times out."""
         told = [command, "--me", f"--name={self._name}", *words]
         try:
             answer = subprocess.run(told, capture_output=True, text=True, check=False, timeout=ANSWER_S)

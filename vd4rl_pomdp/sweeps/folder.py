@@ -104,8 +104,7 @@ class SweepFolder:
         return plans
 
     def plans_to_do(self, name: str = "") -> list[Plan]:
-        """Like `plans`, but raises UserError if the folder was moved, since the jobs' commands still name the old
-        place."""
+        """Like `plans`; UserError if the folder was moved, since the jobs' commands still name the old place."""
         plans = self.plans(name)
         for plan in plans:
             if (plan.made_in / plan.out).resolve() != self.out.resolve():
@@ -138,8 +137,7 @@ class SweepFolder:
         self.add({"job": job, "cause": _RETRIED})
 
     def attempts(self, jobs: Iterable[Job]) -> dict[str, list[Row]]:
-        """Attempts by job name, at the job's current command and since the last `forget`. Truncated lines are
-        skipped."""
+        """Attempts by job name, at its current command and since the last `forget`; truncated lines are skipped."""
         found: dict[str, list[Row]] = {job.name: [] for job in jobs}
         words = {job.name: job.words for job in jobs}
         content = read_bytes(self._attempts) if self._attempts.exists() else b""
@@ -199,9 +197,9 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
     """Progress of a sweep.
 
     Returns:
-        counts: jobs by state. per_hour: rate over the last hour, or since the sweep began. seconds_left: at that
-            rate; None if it is 0. finished: whether nothing is left. states: by job name, done, running, waiting,
-            failed, or blocked by a failed dependency. failures: the last attempt of every failed job.
+        counts: jobs by state. per_hour: rate over the last hour, or since the sweep began. seconds_left: at that rate;
+            None if it is 0. finished: whether nothing is left. states: by job name, done, running, waiting, failed, or
+            blocked by a failed dependency. failures: the last attempt of every failed job.
     """
     left = [job for job in jobs if not is_finished(job)]
     lost = lost_among(left, attempts)

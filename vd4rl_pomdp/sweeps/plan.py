@@ -333,8 +333,7 @@ def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any])
 
 
 def _extras(cell: GridCell, section: str) -> str:
-    """Suffix of a folder's name for the remaining distinguishing settings: ",history=gru,max_k=1", or a hash if too
-    long."""
+    """Folder suffix of the other distinguishing settings: ",history=gru,max_k=1", or a hash if too long."""
     named = {name: cell.sections[section][name] for name in cell.named.get(section, ())}
     words = (f",{name}={value}" for name, value in named.items() if name not in _IN_NAMES[section])
     extras = "".join(words).replace("/", "_")
