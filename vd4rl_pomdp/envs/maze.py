@@ -1,7 +1,7 @@
-"""The mazes as Gymnasium environments: pixels in, accelerations out, goals that move when they are reached.
+"""The mazes as Gymnasium environments with pixel observations, acceleration actions, and goals that are resampled.
 
-Their simulator is gymnasium-robotics' PointMaze U maze with curtains, or with a heading and eyes. Curtains are drawn
-and never collide; goals are never drawn.
+The simulator is gymnasium-robotics' PointMaze U maze, with curtains or with a first-person camera. Curtains are visible
+but do not collide; goals are invisible.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vd4rl_pomdp.envs.pixels import Render, check_render, checked_action
 from vd4rl_pomdp.envs.rendering import mujoco
 
 try:
-    with gl_errors(), contextlib.redirect_stderr(io.StringIO()):  # it announces changes that do not matter here
+    with gl_errors(), contextlib.redirect_stderr(io.StringIO()):  # hide its import-time notices
         import gymnasium_robotics
         from gymnasium_robotics.envs.maze.maps import U_MAZE
         from gymnasium_robotics.envs.maze.maze_v4 import Maze
@@ -37,30 +37,30 @@ except ImportError as error:
 
 POINT_XML = Path(gymnasium_robotics.__file__).parent / "envs" / "assets" / "point" / "point.xml"
 COLLISION_RADIUS = 0.1
-"""Radius of the mass that hits walls."""
+"""Collision radius of the point mass."""
 TIMESTEP = 0.01
 HEADING = 2
-"""Entry of qpos and qvel that is the heading of a mass with eyes."""
+"""Index of the heading in qpos and qvel, in first person."""
 _WALL_HEIGHT = 0.4
 _AHEAD = [0.5, 0.5, -0.5, -0.5]
-"""Orientation of a camera that looks along x with z up."""
+"""Quaternion of a camera that looks along x with z up."""
 ACCELERATION = 10.0
-"""first_person without a `push`: units/s^2 along the heading for an action of 1 (from the top it is 23.9);
-what they come to in a decision is added at its beginning."""
+"""First person without a `push`: acceleration along the heading, in units/s^2, for an action of 1 (from the top: 23.9).
+The velocity change of a whole decision is applied at its start."""
 FASTEST = 5.0
-"""Velocities are limited to this on each axis, as in PointMaze."""
+"""Velocity limit per axis, as in PointMaze."""
 CELL_OFFSET = np.array([0.2, -0.2])
-"""From a cell's centre to the point that stands for it as a goal: the generator's grid lies beside its walls."""
+"""Offset from a cell's centre to its goal point; the original generator's grid is offset from its walls."""
 
 
 class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A point mass in a U-shaped maze, seen from the top (with curtains or not) or in first person.
+    """A point mass in a U-shaped maze, seen from the top (with or without curtains) or in first person.
 
-    Observations: (3, 100, 100) uint8. Actions: (2,) float32 in [-1, 1]: accelerations in x and y, or along the heading
-    and the turning rate. The reward is 1 whenever a goal is reached; nothing terminates. `info` holds `state` (qpos,
-    then qvel: x, y, vx, vy; in first person x, y, heading, vx, vy, angular velocity), `goal` (2,) and `hidden`,
-    whether a curtain covers the whole mass. What differs between mazes is in their `style`. A seed fixes all starts
-    and goals that follow it.
+    Observations: (3, 100, 100) uint8. Actions: (2,) float32 in [-1, 1]: accelerations in x and y or, in first person,
+    acceleration along the heading and turning rate. The reward is 1 whenever a goal is reached; the environment never
+    terminates. `info` holds `state` (x, y, vx, vy; in first person x, y, heading, vx, vy, angular velocity), `goal`
+    (2,) and `hidden`, whether a curtain covers the ball. A maze's parameters are in its `style`. `reset(seed=...)`
+    determines all following starts and goals.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -78,7 +78,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.maze_spec = get_maze(maze)
         self._repeat = action_repeat
         self._point, self.maze = build_simulator(self.maze_spec)
-        """The library's description of the cells."""
+        """gymnasium-robotics' description of the cells."""
         self._pixels, self._render = pixels, render
         self._renderer: MazeRenderer | None = None
         self.observation_space = gymnasium.spaces.Box(0, 255, (3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
@@ -87,9 +87,9 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "render_fps": round(1 / (TIMESTEP * action_repeat))}
         self._picture = np.zeros((3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
         self.goal = np.zeros(2)
-        """(2,) position to go to."""
+        """(2,) position of the goal."""
         self._decisions = 0
-        """Since the goal was drawn."""
+        """Decisions since the goal was sampled."""
 
     @property
     def state(self) -> np.ndarray:
@@ -97,7 +97,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.concatenate([self._point.data.qpos, self._point.data.qvel])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
-        """Put the mass somewhere, at rest, and draw a goal; `options={"state": (P,)}` chooses the state."""
+        """Sample a start at rest and a goal; `options={"state": (P,)}` sets the state instead."""
         super().reset(seed=seed)
         mujoco.mj_resetData(self._point.model, self._point.data)
         qpos = np.zeros(self._point.model.nq)
@@ -110,12 +110,12 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation_and_info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action for the action repeat; UserError for one of another shape, or NaN."""
+        """Repeat an action; UserError if it has another shape or NaN."""
         before, style = self.state[:2], self.maze_spec.style
         self._simulate(np.clip(np.asarray(checked_action(action, 2), np.float64), -1, 1))
         place = self.state[:2]
         near = np.linalg.norm(place - self.goal) <= style.goal_radius
-        # a mass that passes a goal has not reached it: where the planner halts it must also have slowed down
+        # passing through is not enough: where `goal_travel` is finite, the mass must also have slowed down
         reached = bool(near and np.linalg.norm(place - before) < style.goal_travel)
         self._decisions += 1
         if reached or self._decisions == style.goal_decisions:
@@ -124,12 +124,12 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return observation, float(reached), False, False, info
 
     def set_state(self, state: np.ndarray) -> None:
-        """Put the simulator into a (P,) state."""
+        """Set the simulator to a (P,) state."""
         count = self._point.model.nq
         self._point.set_state(np.asarray(state[:count], np.float64), np.asarray(state[count:], np.float64))
 
     def render(self) -> np.ndarray:
-        """The newest picture: (100, 100, 3) uint8."""
+        """The newest image: (100, 100, 3) uint8."""
         return np.ascontiguousarray(self._picture.transpose(1, 2, 0))
 
     def close(self) -> None:
@@ -138,13 +138,13 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._renderer.close()
 
     def is_free(self, place: np.ndarray, room: float = 0.0) -> bool:
-        """Whether the mass fits at a (2,) position, with room around it."""
+        """Whether the mass, enlarged by `room`, fits at position `place` (2,) without touching a wall."""
         corners = place + (COLLISION_RADIUS + room) * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
         cells = [self.maze.cell_xy_to_rowcol(corner) for corner in corners]
         return all(self.maze.maze_map[row][column] != 1 for row, column in cells)
 
     def goal_point(self, place: np.ndarray) -> np.ndarray:
-        """The goal (2,) that a free place stands for: the point of its cell, or itself."""
+        """Goal (2,) for a free position: its cell's goal point if `goals_are_cells`, else the position itself."""
         if not self.maze_spec.style.goals_are_cells:
             return place
         return np.round(place - CELL_OFFSET) + CELL_OFFSET
@@ -153,7 +153,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.goal, self._decisions = self.goal_point(self._free_place(self.maze_spec.style.goal_margin)), 0
 
     def _simulate(self, action: np.ndarray) -> None:
-        """PointMaze's own steps; in first person the velocities are changed first, and no motor runs."""
+        """Run PointMaze's simulator steps; in first person the action sets velocities first, and the motors get 0."""
         if self.maze_spec.first_person:
             self._steer(action)
             action = np.zeros(2)
@@ -167,10 +167,10 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._point.do_simulation(action, self._repeat)
 
     def _steer(self, action: np.ndarray) -> None:
-        """Set the turning rate and push the mass along its heading."""
+        """Set the turning rate and accelerate the mass along its heading."""
         style = self.maze_spec.style
         if style.push is not None and not action.any():
-            return  # the generator leaves velocities alone
+            return  # the original generator does not change velocities then
         push = ACCELERATION * TIMESTEP * self._repeat if style.push is None else style.push
         qpos, qvel = self._point.data.qpos.copy(), self._point.data.qvel.copy()
         qvel[:2] += action[0] * push * np.array([np.cos(qpos[HEADING]), np.sin(qpos[HEADING])])
@@ -178,16 +178,16 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._point.set_state(qpos, qvel)
 
     def _free_place(self, room: float = 0.0) -> np.ndarray:
-        """A position drawn uniformly from where the mass fits, with room around it."""
+        """Position sampled uniformly from where the mass, enlarged by `room`, fits."""
         while True:
             place = self.np_random.uniform(-1.5, 1.5, 2)
             if self.is_free(place, room):
                 return place
 
     def draw(self) -> np.ndarray:
-        """Picture of the present state: (3, 100, 100) uint8."""
+        """Image of the current state: (3, 100, 100) uint8."""
         assert self._pixels, "this environment was made without pixels"
-        if self._renderer is None:  # not before: a process that has rendered cannot be forked
+        if self._renderer is None:  # created late, because a process that has rendered cannot be forked
             self._renderer = make_renderer(self.maze_spec, self._point.model, self._render)
         return self._renderer(self._point.data)
 
@@ -200,14 +200,14 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def replay_states(maze: str, state: np.ndarray, actions: np.ndarray, action_repeat: int = ACTION_REPEAT) -> np.ndarray:
-    """True states (T, P) float64 after each of (T, 2) actions from a (P,) state."""
+    """Replay (T, 2) actions from a (P,) state: states (T, P) float64 after each action."""
     env = MazeEnv(maze, action_repeat, pixels=False)
     env.reset(options={"state": state})
     return np.array([env.step(action)[-1]["state"] for action in actions]).reshape(-1, len(state))
 
 
 def build_simulator(spec: MazeSpec) -> tuple[PointEnv, Maze]:
-    """PointMaze's own simulator on the changed model, and the library's description of the maze."""
+    """PointMaze's simulator with the maze's modified model, and gymnasium-robotics' description of the maze."""
     maze, file = Maze.make_maze(str(POINT_XML), U_MAZE, 1.0, _WALL_HEIGHT)
     try:
         xml = _change(spec, mujoco.MjSpec.from_file(file)).to_xml()
@@ -225,9 +225,9 @@ def build_simulator(spec: MazeSpec) -> tuple[PointEnv, Maze]:
 
 
 def _change(spec: MazeSpec, model: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Remove the goal, move the walls to their height, add curtains and the camera."""
+    """Remove the goal marker, set the walls' height, add curtains and the camera."""
     model.delete(model.site("target"))
-    model.visual.quality.shadowsize = 0  # nothing casts a shadow: the only light is at the camera
+    model.visual.quality.shadowsize = 0  # no visible shadows: the only light is at the camera
     for wall in model.geoms:
         if wall.type == mujoco.mjtGeom.mjGEOM_BOX:
             wall.pos[2] = sum(spec.style.walls) / 2
@@ -239,7 +239,7 @@ def _change(spec: MazeSpec, model: mujoco.MjSpec) -> mujoco.MjSpec:
             pos=[*curtain.center, (bottom + top) / 2],
             size=[*curtain.half, (top - bottom) / 2],
             rgba=[*spec.style.curtain_color, 1.0],
-            contype=0,  # no contacts: a curtain hides and never stops
+            contype=0,  # no collisions: a curtain only hides
             conaffinity=0,
             group=2,
         )
@@ -251,8 +251,8 @@ def _change(spec: MazeSpec, model: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def _open_eyes(model: mujoco.MjSpec, style: Style) -> None:
-    """For first_person a heading, a camera in the mass, no ball around it, and a sky whose texture is drawn later."""
-    model.visual.map.znear = 0.001  # walls are as near as 0.1
+    """Set up first person: a heading joint, a camera in the mass, no visible ball, and a skybox to be filled later."""
+    model.visual.map.znear = 0.001  # walls come as near as 0.1
     body = model.body("particle")
     body.add_joint(name="heading", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
     body.add_camera(name="view", pos=[0, 0, style.eye_height], quat=_AHEAD, fovy=style.eye_fovy)

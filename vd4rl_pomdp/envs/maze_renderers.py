@@ -1,12 +1,12 @@
-"""Pictures of the mazes, (3, 100, 100) uint8: MuJoCo's own, and the same much faster.
+"""Render the mazes as (3, 100, 100) uint8: with MuJoCo (`exact`), or much faster with our own ray casting (`fast`).
 
-Seen from the top only the ball moves. So MuJoCo draws the maze and its depth once, four times finer than the picture;
-the ball is then a sphere cut by 40x40 rays of the same camera, shaded like MuJoCo's headlight shades, and put where it
-is nearer than what MuJoCo drew. A ball that is wholly behind a curtain therefore changes no pixel.
+From the top, only the ball moves. MuJoCo renders the maze's colours and depths once, at four times the resolution. The
+ball is ray-cast as a sphere with the same camera and MuJoCo's headlight shading, and drawn where it is nearer than the
+stored depth. So a ball fully behind a curtain changes no pixel.
 
-In first person a ray for each column finds the nearest wall. The light shines where the camera looks, so a wall's face
-has one shade, the floor none but the ambient one, and the picture is made of five colours and the sky's, which are
-looked up by azimuth in a panorama of the cube texture that MuJoCo draws, averaged over 2x2 rays.
+In first person, one ray per column finds the nearest wall. The headlight shines along the view direction, so each wall
+face has a single shade and the floor only ambient light: five colours plus the sky. The sky is looked up by azimuth in
+a panorama of MuJoCo's cube texture. Pixels are averages of 2x2 rays.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.envs.rendering import mujoco
 
 _FINE = 4
-"""Rays for each pixel, in each direction."""
+"""Supersampling factor per axis."""
 _BALL_COLOR = np.array([0.3, 0.6, 0.3])
 _WALL_COLOR = np.array([0.7, 0.5, 0.3])
 _FLOOR_LIGHT, _FLOOR_DARK, _SQUARE = np.array([0.2, 0.3, 0.4]), np.array([0.1, 0.2, 0.3]), 2.0
 _GROUND = -0.1
 _AMBIENT, _DIFFUSE, _SPECULAR, _SHININESS = 0.4, 0.8, 0.045, 64
-"""MuJoCo's headlight on PointMaze's materials."""
+"""MuJoCo's headlight with PointMaze's materials."""
 
 
 class ExactRenderer:
-    """MuJoCo's picture from the camera `view`, drawn finer and averaged, so that edges are smooth."""
+    """MuJoCo's rendering from the camera `view`, supersampled for smooth edges."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         refuse_after_fork()
@@ -41,8 +41,8 @@ class ExactRenderer:
         close_at_exit(self._renderer)
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Picture of the present state; what a step leaves as places of bodies is where it began."""
-        mujoco.mj_kinematics(self._model, data)  # not mj_forward: it would change what the solver starts the next from
+        """Image of the current state; after a step, MuJoCo's body positions are still those before it."""
+        mujoco.mj_kinematics(self._model, data)  # not mj_forward, which would change the solver's warm start
         mujoco.mj_camlight(self._model, data)
         self._renderer.update_scene(data, camera="view")
         return average(self._rendered(), _FINE)
@@ -67,34 +67,34 @@ class ExactRenderer:
 
 
 def average(fine: np.ndarray, by: int) -> np.ndarray:
-    """(H, W, 3) uint8 -> (3, H / by, W / by) uint8, rounded area averages, by at most 16."""
+    """Downsample (H, W, 3) uint8 to (3, H / by, W / by) uint8 by rounded area averages; `by` is at most 16."""
     rows = np.stack([fine[i::by] for i in range(by)]).sum(0, dtype=np.uint16)
     sums = np.stack([rows[:, i::by] for i in range(by)]).sum(0, dtype=np.uint16)
     return np.ascontiguousarray(((sums + by * by // 2) // (by * by)).astype(np.uint8).transpose(2, 0, 1))
 
 
 class TopRenderer:
-    """The fast picture from the top."""
+    """Fast renderer of the view from the top."""
 
     def __init__(self, model: mujoco.MjModel, style: Style) -> None:
         ball, exact, data = model.site("particle_site"), ExactRenderer(model), mujoco.MjData(model)
         color, ball.rgba[3] = ball.rgba.copy(), 0
         mujoco.mj_forward(model, data)
         self._colors, self._depths = exact.fine_picture(data)
-        """(H, H, 3) and (H, H): the maze without the ball."""
+        """(H, H, 3) and (H, H), of the maze without the ball."""
         exact.close()
         ball.rgba[:] = color
         self._picture = average(self._colors, _FINE)
         self._height = style.camera_height
         side, half = PICTURE_SIZE * _FINE, np.tan(np.radians(style.camera_fovy) / 2)
         self._slope = ((np.arange(side) + 0.5) / side * 2 - 1) * half
-        """(side,) sideways travel of a ray for each unit of depth, by column."""
+        """(side,) slope of each column's rays: sideways distance per unit of depth."""
         across = 2 * 1.05 * BALL_RADIUS / self._height / half * side / 2
         self._window = int(np.ceil(across / _FINE) + 2) * _FINE
-        """Rays across the square in which the ball is drawn: a multiple of _FINE with room for the whole ball."""
+        """Side, in rays, of the square in which the ball is drawn: a multiple of _FINE that fits the whole ball."""
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Picture of a state."""
+        """Image (3, 100, 100) uint8 of the current state."""
         picture = self._picture.copy()
         x, y = float(data.qpos[0]), float(data.qpos[1])
         left, top = self._corner(x), self._corner(-y)
@@ -114,17 +114,17 @@ class TopRenderer:
         return picture
 
     def _corner(self, sideways: float) -> int:
-        """First ray, a multiple of _FINE, of a window around a coordinate."""
+        """First ray of the window around a coordinate, a multiple of _FINE."""
         center = np.searchsorted(self._slope, sideways / self._height)
         first = (int(center) - self._window // 2) // _FINE * _FINE
         return min(max(first, 0), PICTURE_SIZE * _FINE - self._window)
 
 
 def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays (right, up, -1) from the camera at (0, 0, height) first meet the ball at (x, y, 0).
+    """Intersect rays (right, up, -1) from the camera at (0, 0, height) with the ball at (x, y, 0).
 
     Returns:
-        Depths (inf where a ray misses), and cosines between the ball's surface and the direction to the camera.
+        Depths (inf where a ray misses), and cosines between surface normal and direction to the camera.
     """
     squared = right**2 + up**2 + 1
     along = right * x + up * y + height
@@ -134,12 +134,12 @@ def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float, height: f
 
 
 class FirstPersonRenderer:
-    """The fast picture from the ball. It leaves out the faint highlight on walls that are faced squarely."""
+    """Fast renderer of the first-person view, without the faint specular highlight on walls seen head-on."""
 
     _FINE = 2
     _SKY, _LIGHT, _DARK, _SHADED, _WALL_X, _WALL_Y = range(6)
     _OFFSET = 64
-    """An even number of floor squares that makes all places positive."""
+    """Even number of floor squares added to coordinates, so that they are positive."""
 
     def __init__(self, style: Style) -> None:
         side = PICTURE_SIZE * self._FINE
@@ -150,13 +150,13 @@ class FirstPersonRenderer:
         self._wall_bottom = max(style.walls[0], _GROUND)
         self._sky = _SkyTable(style, self._left, self._up[: side // 2])
         self._to_floor = (self._eye - _GROUND) / steps[side // 2 :, None]
-        """(side / 2, 1) distance ahead at which the rays of the lower half meet the floor."""
+        """(side / 2, 1) distance ahead at which the lower half's rays hit the floor."""
         cells = [(row, column) for row in range(5) for column in range(5) if (row, column) not in FREE_CELLS]
         self._walls = np.array([(c + 0.5 - HALF_SIZE, HALF_SIZE - r - 0.5) for r, c in cells])[:, None]
         """(walls, 1, 2) centres of the wall cells."""
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Picture of a state."""
+        """Image (3, 100, 100) uint8 of the current state."""
         place, heading = data.qpos[:2], float(data.qpos[2])
         ahead = np.array([np.cos(heading), np.sin(heading)])
         rays = ahead + self._left[:, None] * np.array([-ahead[1], ahead[0]])
@@ -172,7 +172,7 @@ class FirstPersonRenderer:
         return picture
 
     def _floor(self, place: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Kinds (rows of the lower half, columns) of the floor's squares."""
+        """Floor kinds, light or dark square, (rows of the lower half, columns)."""
         x, y = (
             (self._to_floor * (rays[:, i] / _SQUARE) + (place[i] / _SQUARE + self._OFFSET)).astype(np.int32)
             for i in (0, 1)
@@ -180,7 +180,7 @@ class FirstPersonRenderer:
         return np.where((x ^ y) & 1, np.uint8(self._LIGHT), np.uint8(self._DARK))
 
     def _nearest_wall(self, place: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance ahead (columns,) of the first wall on each (columns, 2) ray, and the axis of its face."""
+        """Distance ahead (columns,) of the nearest wall on each ray (columns, 2), and the axis of the face hit."""
         with np.errstate(divide="ignore", invalid="ignore"):
             one, other = ((self._walls + half - place) / rays for half in (-0.5, 0.5))
         enter, leave = np.minimum(one, other), np.maximum(one, other)
@@ -190,7 +190,7 @@ class FirstPersonRenderer:
         return hit[wall, columns], enter[wall, columns].argmax(-1)
 
     def _color(self, kinds: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-        """The picture of (side, side) kinds, averaged over the rays of each pixel."""
+        """Image of (side, side) kinds, averaged over the rays of each pixel."""
         walls = [_WALL_COLOR * (_AMBIENT + _DIFFUSE * light) for light in (0.0, *np.abs(ahead))]
         colors = np.array([np.zeros(3), _FLOOR_LIGHT * _AMBIENT, _FLOOR_DARK * _AMBIENT, *walls])
         palette = (np.minimum(colors, 1) * 255 + 0.5).astype(np.uint16)
@@ -200,11 +200,11 @@ class FirstPersonRenderer:
 
 
 FACE = 400
-"""Texels along an edge of the cube."""
+"""Texels per edge of the skybox cube."""
 BINS = 2048
-"""Columns of a panorama: azimuths from -pi on, counterclockwise."""
+"""Columns of a panorama: azimuths from -pi, counterclockwise."""
 _TOP, _STARS, _TWINKLE = np.array([0.4, 0.6, 0.8]), 0.01, 2
-"""PointMaze's sky: the colour straight up (black is straight down), the share of white texels, their fineness."""
+"""PointMaze's sky: colour at the zenith (black at the nadir), share of white texels, star texels per texel edge."""
 _ACROSS = (np.arange(FACE) + 0.5) / FACE * 2 - 1
 _ROW, _COLUMN = (axis.ravel() for axis in np.meshgrid(_ACROSS, _ACROSS, indexing="ij"))
 _ONE = np.ones(FACE * FACE)
@@ -216,28 +216,28 @@ _FACES = (
     (_COLUMN, -_ONE, -_ROW),
     (-_COLUMN, _ONE, -_ROW),
 )
-"""Where MuJoCo shows a face's texels: x, y and z of their directions."""
+"""Directions (x, y, z) of each cube face's texels, in MuJoCo's order."""
 
 
 def sky_texture(sky: Sky) -> np.ndarray:
-    """(6 * FACE * FACE * 3,) uint8, as in `tex_data` of a skybox of that size."""
+    """Skybox texture, (6 * FACE * FACE * 3,) uint8 as in MuJoCo's `tex_data`."""
     if sky == "none":
         return np.zeros(6 * FACE * FACE * 3, np.uint8)
     x, y, z = np.concatenate([np.stack(face) for face in _FACES], 1)
-    if sky == "compass":  # the colour circle once around the horizon; its luminance rises and falls once, too
+    if sky == "compass":  # one turn of the colour wheel around the horizon; luminance has one maximum, too
         colors = 0.5 + 0.5 * np.cos(np.arctan2(y, x)[:, None] - np.array([0, 2, 4]) * np.pi / 3)
     else:
         share = np.arctan2(z, np.hypot(x, y)) / (np.pi / 2)
         colors = (1 + share / np.sqrt(1 + share**2) * np.sqrt(2))[:, None] / 2 * _TOP  # MuJoCo's builtin gradient
         side = FACE * _TWINKLE
-        stars = np.random.default_rng(0).random((6, side, side), np.float32) < _STARS  # the same stars always
+        stars = np.random.default_rng(0).random((6, side, side), np.float32) < _STARS  # fixed seed: same stars always
         light = stars.reshape(6, FACE, _TWINKLE, FACE, _TWINKLE).mean((2, 4)).ravel()
         colors = colors + light[:, None] * (1 - colors)
     return (colors * 255 + 0.5).astype(np.uint8).ravel()
 
 
 def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
-    """Colours (BINS, E, 3) uint8 of a `sky_texture` by azimuth and by (E,) elevations in radians."""
+    """Colours (BINS, E, 3) uint8 of a `sky_texture`, by azimuth and elevation (E,) in radians."""
     azimuth = (np.arange(BINS)[:, None] + 0.5) / BINS * 2 * np.pi - np.pi
     level = np.cos(elevations)
     x, y, z = np.broadcast_arrays(np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevations))
@@ -252,22 +252,22 @@ def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
 
 
 class _SkyTable:
-    """The sky of a panorama, for the rays of a picture's upper half."""
+    """Looks up the sky in a panorama, for the rays of the image's upper half."""
 
     _STEP = 2 * np.pi / BINS
 
     def __init__(self, style: Style, left: np.ndarray, up: np.ndarray) -> None:
-        """For rays (1, left, up) by (columns,) and (rows, 1) slopes."""
+        """Prepare for rays (1, left, up), with slopes `left` (columns,) and `up` (rows, 1)."""
         self._black = style.sky == "none"
         elevation = np.arctan2(up, np.hypot(1, left))
         levels = np.arange(0, elevation.max() + self._STEP, self._STEP)
         self._panorama = panorama(sky_texture(style.sky), levels)
         self._level = (elevation / self._STEP + 0.5).astype(np.int32)
-        """(rows, columns) entry of the panorama's second axis."""
+        """(rows, columns) index into the panorama's elevation axis."""
         self._azimuth = np.arctan(left)
 
     def add_to(self, picture: np.ndarray, seen: np.ndarray, heading: float) -> None:
-        """Add the sky to a (3, H / 2, H) picture that is black there, where (rows, columns) finer rays see it."""
+        """Add the sky to an image (3, H / 2, H), black where sky is; `seen` (rows, columns): rays that hit the sky."""
         if self._black or not seen.any():
             return
         column = ((heading + self._azimuth + np.pi) / self._STEP).astype(np.int32) % BINS
@@ -279,7 +279,7 @@ MazeRenderer = ExactRenderer | TopRenderer | FirstPersonRenderer
 
 
 def make_renderer(spec: MazeSpec, model: mujoco.MjModel, render: Render) -> MazeRenderer:
-    """What draws a maze: `exact` is MuJoCo alone with smooth edges, `fast` the rays."""
+    """Renderer of a maze: MuJoCo with supersampling for `exact`, ray casting for `fast`."""
     if render == "exact":
         return ExactRenderer(model)
     return FirstPersonRenderer(spec.style) if spec.first_person else TopRenderer(model, spec.style)

@@ -1,9 +1,9 @@
-"""The mazes of the navigation experiment: names, how each is built, seen and driven, what a state's numbers are.
+"""The mazes of the navigation experiment: geometry, cameras, dynamics, goals, and the layout of states.
 
-Distances are PointMaze's: a cell is 1 wide, the maze spans [-2.5, 2.5] in x and y, free cells form a U open to the
-left. The first four are built like the paper's: the numbers are those of the generator that one of its authors
-published (a fork of D4RL, github.com/bennevans/D4RL), also those of actions, where the paper's text has Gaussian noise.
-The others are variants of them under names of their own.
+Units are PointMaze's: a cell is 1 wide, the maze spans [-2.5, 2.5] in x and y, and the free cells form a U open to the
+left. The first four mazes are the paper's. Their parameters come from a generator that one of its authors published (a
+fork of D4RL, github.com/bennevans/D4RL), including those of actions, where the paper's text has Gaussian noise instead.
+The other mazes are variants.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import numpy as np
 from vd4rl_pomdp.core.errors import refuse_unknown
 
 ACTION_REPEAT = 5
-"""Simulator steps of 0.01 s for one action."""
+"""Simulator steps, of 0.01 s, per action."""
 MOST_STEPS = 1000
-"""Most simulator steps for one action: ten seconds."""
+"""Largest action repeat: ten seconds."""
 PICTURE_SIZE = 100
-"""Height and width of a picture."""
+"""Height and width of an image."""
 FREE_CELLS = ((1, 1), (1, 2), (1, 3), (2, 3), (3, 3), (3, 2), (3, 1))
-"""Rows and columns of the 5x5 map's free cells, along the U."""
+"""(row, column) of the free cells of the 5x5 map, in order along the U."""
 HALF_SIZE = 2.5
-"""The maze's outer walls are at -2.5 and 2.5, its upper left cell is row 0 and column 0."""
+"""The maze spans -2.5 to 2.5; its upper left cell is (0, 0)."""
 BALL_RADIUS = 0.2
-"""Radius of the ball that is drawn (PointMaze's site); the one that collides has a radius of 0.1."""
+"""Radius of the visible ball (PointMaze's site); the collision radius is 0.1."""
 Sky = Literal["none", "stars", "compass"]
-"""Black; a vertical gradient with white stars; or colours that go once around the horizon."""
+"""Black, a vertical gradient with white stars, or the colour wheel around the horizon."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Curtain:
 
 @dataclass(frozen=True)
 class Style:
-    """How mazes of one kind are built, seen and driven. Heights: the floor is at -0.1, the ball's centre at 0."""
+    """Parameters of a family of mazes. Heights: the floor is at -0.1, the ball's centre at 0."""
 
     walls: tuple[float, float] = (-0.2, 0.2)
     """Bottom and top of the walls."""
@@ -51,44 +51,44 @@ class Style:
     """By default the walls' colour."""
     camera_height: float = 7.0
     camera_fovy: float = 30.0
-    """Degrees; the camera hangs over the centre and looks down."""
+    """Field of view in degrees; the camera is above the centre and looks down."""
     hidden_reach: float = 1.03 * BALL_RADIUS
-    """How far from its centre the ball may be seen from above, perspective included."""
+    """Radius of the ball as seen from above, perspective included."""
     hidden_within: float = 1.5
-    """The outer walls' faces: what of the ball lies behind them no curtain need hide."""
+    """The outer walls' inner faces, at +-1.5: the part of the ball beyond them is hidden anyway."""
     eye_height: float = 0.0
     eye_fovy: float = 60.0
-    """Height above the ball's centre, and degrees, of the first person's camera."""
+    """First-person camera: height above the ball's centre, and field of view in degrees."""
     sky: Sky = "stars"
-    """What the first person sees above the walls."""
+    """Sky in first person."""
     turning_rate: float = 40.0
-    """First person: radians/s that an action of 1 sets."""
+    """First person: turning rate in radians/s for an action of 1."""
     heading_damping: float = 2.48
-    """Leaves 0.403 of the turning rate after each simulator step: 0.27 radians for 5 steps and an action of 1."""
+    """Leaves 0.403 of the turning rate after each simulator step: an action of 1 turns 0.27 radians in 5 steps."""
     push: float | None = 0.1
-    """First person: change of velocity for an action of 1, once a decision; None: what 10 units/s^2 come to in it."""
+    """First person: velocity change per decision for an action of 1; None: that of accelerating at 10 units/s^2."""
     limited_every_step: bool = False
-    """Velocities are limited to 5 before every simulator step, as PointMaze does, or once a decision."""
+    """Limit velocities to 5 before every simulator step, as PointMaze does, instead of once per decision."""
     goal_radius: float = 0.1
     goal_travel: float = 0.1
-    """A goal is reached within this distance by a mass that has moved less than this in the last decision."""
+    """A goal is reached if the mass is within goal_radius and moved less than goal_travel in the last decision."""
     goal_decisions: int = 150
-    """Decisions after which another goal is drawn anyway; 0 for never."""
+    """Decisions after which a new goal is sampled even if the goal was not reached; 0: never."""
     goal_margin: float = 0.1
-    """Goals are uniform where the mass has this much room."""
+    """Goals are uniform over positions where the mass is at least this far from walls."""
     goals_are_cells: bool = True
-    """A goal is the point of its cell that the planner heads for."""
+    """Move a goal to its cell's goal point, which the planner heads for."""
     noise: float = 0.0
-    """Standard deviation of Gaussian noise on every action of the data."""
+    """Standard deviation of Gaussian noise on every action in the data."""
     zero_share: float = 0.1
     random_share: float = 0.1
-    """Shares of the data's actions that are zero, and uniformly random."""
+    """Shares of actions in the data that are zero, and uniformly random."""
 
 
 SOURCE = Style()
-"""From the top, as the paper's data was made."""
+"""Top view, as in the paper's data."""
 _FIRST_PERSON = replace(SOURCE, goal_radius=0.5, goal_travel=np.inf, goals_are_cells=False)
-"""In first person, likewise."""
+"""First person, as in the paper's data."""
 HARD = Style(
     walls=(0.0, 0.4),
     curtains=(0.4, 0.5),
@@ -113,48 +113,48 @@ HARD = Style(
     zero_share=0.0,
     random_share=0.0,
 )
-"""Wide curtains under a camera far above, a black sky, and noise on every action."""
+"""Wider curtains, a distant camera, a black sky, and noise on every action."""
 
 
 @dataclass(frozen=True)
 class MazeSpec:
-    """One of the mazes."""
+    """A maze."""
 
     name: str
     paper: str
-    """The maze of the paper that this is, or is a variant of."""
+    """The paper's maze that this one is, or is a variant of."""
     curtains: tuple[Curtain, ...] = ()
     style: Style = SOURCE
 
     @property
     def gym_id(self) -> str:
-        """Gymnasium's id."""
+        """Gymnasium id."""
         return f"vd4rl_pomdp/Maze{self.name.title().replace('_', '')}-v0"
 
     @property
     def driver(self) -> str:
-        """What drives in its data: ppo, or planner."""
+        """Behaviour policy of its data: "ppo" or "planner"."""
         return "ppo" if self.first_person else "planner"
 
     @property
     def first_person(self) -> bool:
-        """Whether it is seen through the mass's own eyes; a state then has a heading."""
+        """Whether the view is first-person; a state then has a heading."""
         return self.paper == "first_person"
 
     @property
     def position(self) -> list[int]:
-        """Entries of a state that are the position."""
+        """Indices of the position in a state."""
         return [0, 1]
 
     @property
     def velocity(self) -> list[int]:
-        """Entries of a state that are the velocity: a state is qpos, then qvel."""
+        """Indices of the velocity in a state, which is qpos followed by qvel."""
         return [3, 4] if self.first_person else [2, 3]
 
     def hidden(self, states: np.ndarray) -> np.ndarray:
-        """Whether a curtain covers all that could be seen of the ball: (..., P) states -> (...,) bool."""
+        """Whether a curtain covers the whole visible ball: (..., P) states -> (...,) bool."""
         reach, within, height = self.style.hidden_reach, self.style.hidden_within, self.style.camera_height
-        # how much larger than themselves a curtain's lower and upper faces appear at the ball's height
+        # perspective: magnification of a curtain's lower and upper faces, projected to the ball's height
         shadows = [1.0] if np.isinf(within) else [height / (height - z) for z in self.style.curtains]
         low, high = (np.clip(states[..., :2] + side, -within, within) for side in (-reach, reach))
         covered = np.zeros(states.shape[:-1], bool)
@@ -189,6 +189,6 @@ MAZES = {
 
 
 def get_maze(name: str) -> MazeSpec:
-    """The maze called `name`; raises UserError listing the choices for an unknown one."""
+    """Look up a maze; UserError with the choices for an unknown name."""
     refuse_unknown("maze", name, MAZES)
     return MAZES[name]

@@ -1,10 +1,10 @@
-"""Rendering as V-D4RL's frames show it: the old skybox restored, a cheaper shadow map, headless by default.
+"""Render dm_control as in V-D4RL's frames: restore the old skybox, optionally use a cheaper shadow map; headless.
 
-From mujoco 3.2.0 on the random stars of dm_control's sky are drawn from another seed, so an encoder pretrained on
-V-D4RL would be evaluated under another sky. The sky of mujoco 3.1.6 is written back before the first render. From 3.12
-on the texture of a floor begins at the floor's corner, no longer at its centre; it is moved back as well.
+mujoco 3.2.0 changed the random stars of dm_control's sky, so an encoder pretrained on V-D4RL would be evaluated under
+another sky: the sky of mujoco 3.1.6 is restored before the first render. mujoco 3.12 moved the origin of floor textures
+from the floor's centre to its corner: this is undone, too.
 
-This module alone imports mujoco and dm_control, after what must happen before OpenGL is loaded.
+Only this module imports mujoco and dm_control, after `envs.opengl` has prepared for OpenGL.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vd4rl_pomdp.envs.opengl import gl_errors, keep_display, refuse_after_fork, 
 from vd4rl_pomdp.envs.pixels import Render
 
 try:
-    with gl_errors():  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
+    with gl_errors():  # both load the OpenGL library named by MUJOCO_GL and fail in many ways if it is missing
         import mujoco
         from dm_control import suite
         from dm_control.mujoco import Camera
@@ -45,14 +45,14 @@ __all__ = [
 
 _SKYBOX = Path(__file__).parent / "assets" / "skybox.npz"
 TRIED_MUJOCO = ((3, 3), (3, 18))
-"""Lowest version and first version not supported: no dm_control starts with mujoco 4."""
+"""Lowest supported version and first unsupported one, as (major, minor)."""
 _TEXTURE_AT_CORNER = (3, 12)
 _FAR = 50.0
 _FAST_SHADOW_SIZE = 512
 
 
 def check_mujoco(version: str = mujoco.__version__) -> None:
-    """Refuse a mujoco whose pixels were never compared with the data's."""
+    """Raise UserError for a mujoco version whose pixels were not compared with the data's."""
     low, high = TRIED_MUJOCO
     if not low <= _numbers(version) < high:
         raise UserError(
@@ -62,14 +62,15 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Major and minor."""
+    """(major, minor) of a version."""
     return tuple(int(part) for part in version.split(".")[:2])
 
 
 def prepare(physics: Any, render: Render, size: int) -> None:
-    """Restore the old sky, set the shadow map's size, and that of the buffer to what `size` x `size` pictures need.
+    """Restore the old sky and floors, and set the sizes of the shadow map and of the offscreen buffer.
 
-    Must be called before the first render of `physics`. The buffer, 640x480 by default, is cleared for every picture.
+    Call it before the first render of `physics`. The buffer, 640x480 by default, is cleared for every frame, so it is
+    reduced to `size` x `size`.
     """
     model = physics.model
     sky = _sky()
@@ -86,12 +87,11 @@ def prepare(physics: Any, render: Render, size: int) -> None:
 
 
 def _center_floors(model: Any) -> None:
-    """Textures of planes as mujoco drew them before 3.12.
+    """Align the textures of planes as mujoco did before 3.12.
 
-    Along a side of half-length h, with r repeats per unit of length, a texture then began at its middle in the plane's
-    centre, and now begins at its edge in the plane's corner: it has to move by (r h + 1) / 2 of itself. Rolled by that,
-    its smaller copies for distant pixels differ a little from those of the original, so a square floor that ends out
-    of sight is lengthened instead, to where that number is whole.
+    For half-length h and r repeats per unit of length, the texture's middle used to lie at the plane's centre; now its
+    edge lies at the plane's corner. So it must move by (r h + 1) / 2 of its size. Rolling the texture changes its
+    mipmaps slightly; a square floor that ends out of sight is therefore enlarged instead, until that number is whole.
     """
     moved = set()
     for plane in np.flatnonzero(np.asarray(model.geom_type) == mujoco.mjtGeom.mjGEOM_PLANE):
@@ -102,7 +102,7 @@ def _center_floors(model: Any) -> None:
         if texture < 0 or texture in moved or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
             continue
         if (half <= 0).any() or (repeats <= 0).any():
-            continue  # an infinite one is drawn as before
+            continue  # infinite planes did not change
         uniform = model.mat_texuniform[material]
         if uniform and (repeats == 1).all() and half.min() > _FAR and not model.geom_pos[plane, :2].any():
             model.geom_size[plane, :2] = 2 * np.ceil((half - 1) / 2) + 1
@@ -117,27 +117,27 @@ def _center_floors(model: Any) -> None:
 
 
 class FrameCamera:
-    """What a camera shows of a simulator, as V-D4RL stores it.
+    """Renders a simulator's frames in V-D4RL's format.
 
-    `physics.render` would set up a camera for every picture, which takes a sixth of the time of drawing it.
+    It keeps its camera: `physics.render` sets one up for every frame, which adds a sixth of the rendering time.
     """
 
     def __init__(self, physics: Any, size: int = FRAME_SIZE, camera: int = 0) -> None:
-        """Nothing is drawn, and no OpenGL context made."""
+        """Store the arguments; the OpenGL context is created at the first frame."""
         self._physics, self._size, self._number = physics, size, camera
         self._camera: Camera | None = None
 
     def frame(self) -> np.ndarray:
-        """The present state: (3, size, size) uint8."""
+        """Frame of the current state: (3, size, size) uint8."""
         refuse_after_fork()
         with gl_errors(), undisturbed():
             if self._camera is None:
                 self._camera = Camera(self._physics, self._size, self._size, self._number)
             context = self._physics.contexts.gl
-            with context.make_current() as thread:  # dm_control skips this where no other of its own was current,
-                thread.call(context._platform_make_current)  # but mujoco's and Gymnasium's renderers have others
+            with context.make_current() as thread:  # dm_control skips this if it was the last of its own contexts,
+                thread.call(context._platform_make_current)  # but mujoco or Gymnasium may have made theirs current
             image = self._camera.render()
-        return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera draws into one buffer
+        return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera reuses its buffer
 
 
 @cache
@@ -148,7 +148,7 @@ def _sky() -> np.ndarray:
 
 
 def gl_strings() -> dict[str, str]:
-    """Vendor and renderer of the current GL context; empty strings before anything was rendered."""
+    """Vendor and renderer of the current GL context; empty strings before the first render."""
     try:
         from OpenGL import GL  # type: ignore[import-untyped]
 
