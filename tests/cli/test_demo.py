@@ -4,9 +4,10 @@ import pytest
 from PIL import Image
 
 from tests.studies.navigation.test_report import write_run
+from vd4rl_pomdp.agents import shipped
 from vd4rl_pomdp.cli import demo as demos
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.cli.demo import conclusion, demo_jobs, show_navigation
+from vd4rl_pomdp.cli.demo import PAIR, conclusion, demo_jobs, show_navigation
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import write_json
@@ -55,8 +56,9 @@ def test_the_demo_uses_every_stage(tmp_path, preset):
 
 
 def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_path, monkeypatch, capsys):
-    carried, commands = [], []
+    carried, commands, played = [], [], []
     monkeypatch.setattr(demos, "report", lambda words, program: commands.append(words))
+    monkeypatch.setattr(demos, "play", lambda words, program: played.append(words))
 
     def carry_out(plans, folder, kind, options):
         assert folder.plans() == plans, "`sweep status` knows them"
@@ -68,6 +70,8 @@ def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_pat
     monkeypatch.setattr(demos, "carry_out", carry_out)
     main(["demo", "--out", str(tmp_path / "demo"), "--jobs", "3"])
     assert carried == [("local", 3)]
+    assert played == [[*PAIR, "--episodes", "10", "--film", str(tmp_path / "demo" / "agents.webp")]]
+    assert set(PAIR) <= set(shipped())
     assert commands == [[str(tmp_path / "demo" / "runs"), "--out", str(tmp_path / "demo" / "report")]]
     shown = capsys.readouterr()
     told = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
@@ -84,6 +88,7 @@ def test_without_a_gpu_the_demo_does_a_job_a_core_up_to_four(tmp_path, monkeypat
         raise UserError("far enough")
 
     monkeypatch.setattr(demos, "carry_out", carry_out)
+    monkeypatch.setattr(demos, "play", lambda words, program: None)
     for gpus, cores in (([], 2), ([], 64), (["0"], 64)):
         monkeypatch.setattr(demos, "visible_gpus", lambda gpus=gpus: gpus)
         monkeypatch.setattr(demos, "count_workers", lambda wanted, cores=cores: wanted or cores)

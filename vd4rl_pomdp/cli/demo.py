@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
+from vd4rl_pomdp.cli.hub import play
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.cli.studies import report
 from vd4rl_pomdp.cli.sweeps import carry_out
@@ -36,8 +37,11 @@ from vd4rl_pomdp.sweeps.plan import Job, plan_jobs
 GRIDS = {"runs": "quick"} | ({"navigation": "quick_navigation"} if find_spec("gymnasium_robotics") else {})
 """What is carried out, by the folder that it goes to: the mazes where their extra is installed."""
 FILM = "navigation.gif"
+PAIR = tuple(f"walker_walk/medium_expert/patch+zero_frames/{method}" for method in ("mik+a", "acro"))
+"""Agents that ship: the main contrast of results/protocol.md."""
+DUEL = "agents.webp"
 PRESETS = {"cpu": False, "smoke": True}
-"""Whether a preset is the grid's testing subset."""
+"""Whether a preset is the grid's testing subset, and plays one episode in place of ten."""
 MOST_AT_ONCE = 4
 """More jobs at a time than this would end no sooner."""
 
@@ -54,7 +58,7 @@ def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
 
 @command
 def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> None:
-    """Every stage, in minutes: three methods on a small walker_walk set, two in a maze; a table, a report, a film.
+    """Two trained agents side by side; then every stage, in minutes, on small sets; a table, a report, films.
 
     Args:
         out: Folder of the demo's data and runs; re-run the same command to resume.
@@ -68,6 +72,8 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
     refuse_no_folder(out)
     refuse_kept(out)
     planned, folder = demo_jobs(out, preset), SweepFolder(out)
+    play([*PAIR, "--episodes", "1" if PRESETS[preset] else "10", "--film", str(out / DUEL)], "vd4rl-pomdp agents play")
+    print("One training seed each. All seeds: results/protocol. Now the same from the start, small:", flush=True)
     words = ["report", str(out / "runs"), "--out", str(out / "report")]
     for line in (*(job.words for job in planned if not job.finished), words):  # so that they can be run by hand
         print(f"$ vd4rl-pomdp {shlex.join(line)}", file=sys.stderr)

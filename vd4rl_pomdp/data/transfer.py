@@ -186,19 +186,19 @@ class _Reader:
             rows = next(self._episodes, None)
             if rows is None:
                 raise UserError("is missing")
-            frames, told = rows[FRAMES_KEY], self._source.frame_shape
+            frames, size = rows[FRAMES_KEY], self._source.frame_shape
             if len(frames) < 2:
                 raise UserError("has no step: leave it out of the source")
             rows = rows | {"action": self._scaled(rows["action"])}
-            if frames.shape[2:] != told:
-                here, there = (f"{height}x{width}" for height, width in (frames.shape[2:], told))
+            if frames.shape[2:] != size:
+                here, there = (f"{height}x{width}" for height, width in (frames.shape[2:], size))
                 raise UserError(f"has pictures of {here} pixels, its set tells of {there}")
             layout = {key: values.shape[1:] for key, values in rows.items()}
             if frames.dtype != np.uint8 or layout != (self._layout or layout):
                 raise UserError(f"has {frames.dtype} pictures and rows of {layout}, not those of the episodes before")
             self._layout = layout
-            told = {key: values for key, values in rows.items() if key != FRAMES_KEY}
-            check_rows(f"{self._name}: episode {number}", told, len(frames))
+            others = {key: values for key, values in rows.items() if key != FRAMES_KEY}
+            check_rows(f"{self._name}: episode {number}", others, len(frames))
             self._read += 1
             self._still += np.array_equal(frames[1], frames[0]) and bool((frames[1:] == frames[0]).all())
             self._joined += number == self._next and np.array_equal(frames[0], self._last)

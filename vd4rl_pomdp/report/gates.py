@@ -39,8 +39,8 @@ from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words
 STATE_SHARE = 0.9
 """Minimum return of `state`, as a fraction of the data's mean return."""
 PUBLISHED_SHARE, ACRO_SHARE = 0.8, 0.7
-"""Minimum return of `acro` under `none`: PUBLISHED_SHARE of the best published return of BASELINES, capped at the
-data's mean return; ACRO_SHARE of the data's mean return where no score is published for the dataset's quality."""
+"""Minimum return of `acro` under `none`: PUBLISHED_SHARE of the highest published return of BASELINES or of the
+data's mean return, whichever is smaller; ACRO_SHARE of the latter if no score is published for the quality."""
 BASELINES = {"bc": "BC", "drq_bc": "DrQ+BC"}
 """V-D4RL's offline baselines from pixels, by column of `published_scores`."""
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"

@@ -32,9 +32,9 @@ def critic_of(
     Returns:
         `value`: mean of VALUE over the rows of the last fifth of the updates.
         `moved`: relative drift over that fifth: least-squares slope over these rows, times a fifth of the updates,
-        divided by `value`. None with fewer than FEWEST rows or a value of 0.
+            divided by `value`. None with fewer than FEWEST rows or a value of 0.
         `data`: discounted return of the data, mean_reward / (1 - gamma): the value of the behaviour policy in a
-        task that never ends, for any `n_step`. None if unknown.
+            task that never ends, for any `n_step`. None if unknown.
     """
     told = [(row["step"], row[VALUE]) for row in rows if VALUE in row and row["step"] > updates - updates / 5]
     if not told:

@@ -12,9 +12,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.agents import SHIPPED, shipped
 from vd4rl_pomdp.report.gates import episodes_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.studies.navigation.measures import online_error, refitted_error
 from vd4rl_pomdp.studies.navigation.report import write_report
 
@@ -85,6 +87,14 @@ def intervals(returns: list[np.ndarray]) -> Iterator[str]:
         yield with_interval(one.mean() - other.mean(), *(difference_interval(one, other) or (None, None)), 0)
 
 
+def of_agents() -> Iterator[str]:
+    """Of the episodes in the cards of the agents that ship, under the corruption of their training."""
+    for name in shipped():
+        card = read_json(SHIPPED / name / "card.json")
+        rows = [row for row in card["episodes"] if row["evaluated_under"] == card["corruption"]["corruption"]]
+        yield from intervals([np.array([[row["return"]] for row in rows])])
+
+
 def of_mazes(script: ModuleType) -> Iterator[str]:
     """Of the pages' measures in every maze; differences only between settings of one method in one maze."""
     numbers = script.numbers_in()
@@ -103,7 +113,11 @@ def known() -> set[str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "tools")
         script = importlib.import_module("navigation_table")
-    return {word for folders in places for word in of_returns(folders)} | {*of_shifts(), *of_mazes(script)}
+    return {word for folders in places for word in of_returns(folders)} | {
+        *of_shifts(),
+        *of_agents(),
+        *of_mazes(script),
+    }
 
 
 def unknown(text: str, known: set[str]) -> list[str]:
