@@ -1,4 +1,4 @@
-"""What every fine-tuning algorithm must satisfy: its losses, what they move, its targets, state, draws and stacks."""
+"""Conformance checks of fine-tuning algorithms: losses, parameter updates, target networks, resuming, stacking."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, 
 
 DIM, ACTIONS, SIZE = 3, 2, 32
 UPDATES = 4
-"""Enough for an algorithm to step along each of its losses twice."""
+"""Enough for an algorithm with delayed updates to step along each of its losses twice."""
 
 
 def check_algorithm(name: str, **options: Any) -> None:
-    """Check every promise of a fine-tuning algorithm.
+    """Run all checks on a fine-tuning algorithm.
 
     Args:
-        name: of the algorithm in `finetune.algorithms.ALGORITHMS`.
+        name: name in `finetune.algorithms.ALGORITHMS`.
         options: its options.
 
     Raises:
-        AssertionError: a promise is broken; says which one, and by what.
+        AssertionError: a promise is broken; the message says which and how.
         UserError: there is no such algorithm or option.
     """
     run_checks("algorithm", CHECKS, name, **options)
 
 
 def batch(number: int = 0) -> FeatureBatch:
-    """Transitions of which every other one ends its episode for good."""
+    """Random transitions, every other one of which is terminal."""
     g = torch.Generator().manual_seed(number)
     z, next_z = (5 + 3 * torch.randn(SIZE, DIM, generator=g) for _ in range(2))
     action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
@@ -49,7 +49,7 @@ def batch(number: int = 0) -> FeatureBatch:
 
 
 def make(name: str, seed: int = 0, **options: Any) -> Algorithm:
-    """An algorithm with a small policy, the same for every seed."""
+    """An algorithm with a small policy; identical for equal seeds."""
     chosen = FinetuneConfig.of("smoke", algorithm=name, **options).options
     torch.manual_seed(seed)
     policy = Policy(DIM, ACTIONS, 16)
@@ -61,18 +61,18 @@ def make(name: str, seed: int = 0, **options: Any) -> Algorithm:
 
 @dataclass
 class Step:
-    """One loss of an update, and the networks before and after the step along it."""
+    """One optimiser step of an update, with the networks before and after it."""
 
     loss: Loss
     optimiser: Optimizer
     reached: list[Tensor | None]
-    """Gradients of the loss: of its optimiser's parameters, then of the representations."""
+    """Gradients of the loss with respect to the optimiser's parameters, then to the representations."""
     before: dict[str, Tensor]
     after: dict[str, Tensor]
 
 
 def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict[str, Tensor]]:
-    """Make an update; its steps, and what it returns."""
+    """Run one update; returns its optimiser steps and its logs."""
     z = given.z.requires_grad_()
     steps: list[Step] = []
     step = algorithm.step
@@ -92,7 +92,7 @@ def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict
 
 
 def tensors_of(state: Any, path: str = "") -> dict[str, Tensor]:
-    """Copies of all tensors of a nested state, by path."""
+    """Copies of all tensors in nested dicts and lists, by path."""
     if isinstance(state, Tensor):
         return {path: state.detach().clone()}
     items = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else ()
@@ -175,7 +175,7 @@ def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) ->
     targets = {part: module for part, module in _modules(algorithm).items() if part.startswith("target_")}
     with torch.no_grad():
         for parameter in (p for module in targets.values() for p in module.parameters()):
-            parameter.add_(0.5)  # targets begin as copies, whose steps would be too small to tell
+            parameter.add_(0.5)  # targets start as copies, so their first moves would be too small to detect
     crept = set()
     for number in range(UPDATES):
         before = _networks(algorithm)
@@ -196,7 +196,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
     one, other = (make(name, seed=seed, **options) for seed in (0, 1))
     for number in range(3):
         one.update(batch(number))
-    other.load_state_dict(unpack(pack(one.state_dict())))  # through the checkpoint's own form, as a run resumes
+    other.load_state_dict(unpack(pack(one.state_dict())))  # serialised as in a checkpoint
     for number in range(3, 3 + UPDATES):
         logs = []
         for seed, algorithm in enumerate((one, other)):
@@ -209,7 +209,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
 
 
 def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
-    """An algorithm that reads the rows of every batch in another order: the same, but for the order of summation."""
+    """Make an algorithm permute the rows of every batch: the same mathematics in another order of summation."""
 
     def each(function: Callable[..., Any], given: FeatureBatch, *tensors: Tensor) -> Any:
         order = torch.randperm(len(given.z), generator=torch.Generator().manual_seed(seed)).to(given.z.device)
@@ -225,12 +225,12 @@ def farther_than_rounding(
     single: Callable[[Callable[[Algorithm], Algorithm]], Mapping[str, Tensor]],
     times: float = 4.0,
 ) -> list[str]:
-    """Which tensors are farther from those of a single run than rounding takes it, and how far.
+    """Tensors that differ from those of a single run by more than rounding explains, with the differences.
 
     Args:
         found: the tensors by name.
-        single: gives those of a single run, made anew and changed as it is told before its first update.
-        times: how often what three other orders of summation, or float32's last digit, change a tensor at most.
+        single: runs a single run anew and returns its tensors; its argument modifies the algorithm before it starts.
+        times: tolerance, in multiples of the largest change by three other summation orders or float32's epsilon.
     """
     expected = single(lambda algorithm: algorithm)
     others = [single(lambda algorithm, seed=seed: permuted(algorithm, seed)) for seed in range(3)]  # type: ignore[misc]
@@ -247,7 +247,7 @@ def farther_than_rounding(
 
 
 def course(algorithm: Algorithm, logs: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Where updates ended, and each scalar that they logged on the way, as one tensor."""
+    """Final state tensors, and each logged scalar's series as one tensor."""
     series: dict[str, list[Tensor]] = {}
     for row in logs:
         for key, value in row.items():

@@ -1,4 +1,4 @@
-"""What every corruption must satisfy: it is a pure function of a stack and its key, in data and environment alike."""
+"""Conformance checks of corruptions: pure functions of a stack and its key, equal in data and environment."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _MODES: tuple[Mode, ...] = get_args(Mode)
 
 
 def check_corruption(name: str, **options: Any) -> None:
-    """Check every promise of a corruption.
+    """Run all checks on a corruption.
 
     Args:
-        name: of a stage in `vd4rl_pomdp.corruptions.STAGES`, or of several, joined by `+`.
+        name: name of a stage in `vd4rl_pomdp.corruptions.STAGES`, or several joined by `+`.
         options: the stages' options.
 
     Raises:
-        AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such stage or option, or a setting of the training has an option's name.
+        AssertionError: a promise is broken; the message says which and how.
+        UserError: there is no such stage or option, or an option has the name of a pretraining setting.
     """
     CorruptionConfig.of(name, **options)
     PretrainConfig.of("smoke", corruption=name, **options)
@@ -49,7 +49,7 @@ def check_corruption(name: str, **options: Any) -> None:
 
 
 def stacks(count: int = STACKS) -> Tensor:
-    """(count, C, S, S) uint8 random pixels from 1 on, the same at every call."""
+    """Random stacks (count, C, S, S) uint8 without zeros; identical at every call."""
     shape = (count, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE)
     return torch.randint(1, 256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
@@ -88,7 +88,7 @@ def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
     seen = []
     for seed in (1, 2):
         torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002 (what a stage must not read)
+        np.random.seed(seed)  # noqa: NPY002 (a stage must not use it)
         corruption = _make(name, options)
         seen += [corruption(stacks(), torch.arange(STACKS)) for _ in range(2)]
     claim(all(torch.equal(seen[0], other) for other in seen), "equal keys gave different pixels")
@@ -110,7 +110,7 @@ def frames_that_are_dropped_stay_dropped(name: str, **options: Any) -> None:
 
 
 def _frames(obs: Tensor) -> Tensor:
-    """(N, 3 * K, S, S) stacks as (N, K, 3, S, S) frames, the same memory."""
+    """View stacks (N, 3 * K, S, S) as frames (N, K, 3, S, S)."""
     return obs.view(len(obs), FRAME_STACK, 3, *obs.shape[-2:])
 
 

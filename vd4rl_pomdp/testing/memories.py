@@ -1,4 +1,4 @@
-"""What every memory must satisfy: shapes, streams like batches, the past alone, padding, and a folder."""
+"""Conformance checks of memories: shapes, streaming, causality, padding, saving and loading."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, 
 BATCH, ROWS, INPUTS = 3, 6, 5
 _WIDTH = 7
 _METHODS = ({"method": "mik+a"}, {"method": "mik"}, {"method": "mik+a", "m": 2}, {"method": "mik", "m": 2})
-"""Memories that read actions and that do not, of the whole past and of three rows."""
+"""Methods with and without actions, over the whole past and over three rows."""
 
 
 def check_memory(name: str, **options: Any) -> None:
-    """Check every promise of a memory.
+    """Run all checks on a memory.
 
     Args:
-        name: of the memory in `vd4rl_pomdp.nn.memory.MEMORIES`.
+        name: name in `vd4rl_pomdp.nn.memory.MEMORIES`.
         options: its options.
 
     Raises:
-        AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such memory or option, or a setting of the training has an option's name.
+        AssertionError: a promise is broken; the message says which and how.
+        UserError: there is no such memory or option, or an option has the name of a pretraining setting.
     """
     PretrainConfig.of("smoke", history=name, **options)
     run_checks("memory", CHECKS, name, **options)
 
 
 def make(name: str, **options: Any) -> Memory:
-    """The memory, for rows of INPUTS numbers, the last two an action; the same at every call."""
+    """The memory for rows of INPUTS numbers, the last two of which are an action; identical at every call."""
     torch.manual_seed(0)
     return make_memory(name, INPUTS, {"hidden_dim": _WIDTH} | options, INPUTS - 2)
 
 
 def encoder_of(name: str, **settings: Any) -> Encoder:
-    """An encoder of observations of three numbers with the memory; the same at every call."""
+    """An encoder with the memory, for observations of three numbers; identical at every call."""
     told = {"frame_encoder": "flat", "action_target": "mse", "hidden_dim": _WIDTH} | settings
     config = PretrainConfig.of("smoke", history=name, **told)
     torch.manual_seed(0)
@@ -53,12 +53,12 @@ def encoder_of(name: str, **settings: Any) -> Encoder:
 
 
 def rows(batch: int = BATCH) -> Tensor:
-    """(batch, ROWS, INPUTS) random rows, the same at every call."""
+    """Random rows (batch, ROWS, INPUTS); identical at every call."""
     return torch.randn(batch, ROWS, INPUTS, generator=torch.Generator().manual_seed(0))
 
 
 def windows() -> Windows:
-    """Random windows of ROWS rows without padding, the same at every call."""
+    """Random windows of ROWS rows without padding; identical at every call."""
     g = torch.Generator().manual_seed(1)
     obs = torch.randint(0, 256, (BATCH, ROWS, 3, 1, 1), generator=g, dtype=torch.uint8)
     action = torch.rand(BATCH, ROWS, 2, generator=g)
@@ -96,7 +96,7 @@ def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
 
     Of a memory with a `reach`, to that many rows at most.
     """
-    # in float64: gradients across many rows are small, and none may be lost to rounding
+    # in float64, so that small gradients across many rows do not underflow
     memory, x = make(name, **options).double(), rows().double().requires_grad_()
     out, _ = run_memory(memory, x)
     weights = torch.randn(out.shape[-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -133,7 +133,7 @@ def observations_are_read_where_it_says(name: str, **options: Any) -> None:
         for row in range(ROWS):
             changed = window.obs.clone()
             changed[:, row] = 255 - changed[:, row]
-            with torch.no_grad():  # not `encode`, which gives such a memory no later features to begin with
+            with torch.no_grad():  # not `encode`, which skips later features if `first_only`
                 features = (encoder.frame(obs) for obs in (window.obs, changed))
                 plain, other = (encoder.from_features(one, window.prev_action) for one in features)
             moved = plain != other

@@ -1,4 +1,4 @@
-"""What every task must satisfy: episodes that repeat, rows of the declared shapes, ends and discounts, replay."""
+"""Conformance checks of tasks: reproducible episodes, shapes, episode ends and discounts, action bounds, replay."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ DECISIONS = 12
 
 
 def check_task(name: str) -> None:
-    """Check every promise of a task, by playing a few short episodes of it.
+    """Run all checks on a task, by playing a few short episodes.
 
     Args:
-        name: of the task in `vd4rl_pomdp.core.tasks.TASKS`.
+        name: name in `vd4rl_pomdp.core.tasks.TASKS`.
 
     Raises:
-        AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such task, or its environment cannot be built, shows no pictures or pays no numbers.
+        AssertionError: a promise is broken; the message says which and how.
+        UserError: there is no such task, or its environment cannot be built or returns no images or numeric rewards.
     """
     TASKS.named(name)
     run_checks("task", CHECKS, name)
@@ -37,7 +37,7 @@ def make(name: str, size: int | None = None, length: int = DECISIONS) -> PixelEn
 
 
 def play(env: PixelEnv, seed: int) -> tuple[list[TimeStep], np.ndarray]:
-    """All rows of a seed's episode under random actions, the same at every call, and these actions (T, A) float32."""
+    """Play a seed's episode with fixed random actions; returns its rows and the actions (T, A) float32."""
     rng = np.random.default_rng(0)
     rows: list[TimeStep] = [env.reset(seed)]
     actions: list[np.ndarray] = []
@@ -150,7 +150,7 @@ def rewards_replay(name: str) -> None:
     if not isinstance(task, DMCTask) or not replays(task):
         return
     env = make(name)
-    for seed in (3, 4):  # the second episode starts from a used simulator
+    for seed in (3, 4):  # the second episode starts in a simulator that was used before
         rows, actions = play(env, seed)
         found, paid = replay_rewards(name, rows[0].physics, actions), [row.reward for row in rows[1:]]
         claim(np.array_equal(found, paid), f"{paid} were paid, {found.tolist()} are replayed")
