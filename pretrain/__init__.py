@@ -1,3 +1,3 @@
-"""Stage one: representations from pixels and actions alone."""
+"""Stage one: representation learning from pixels and actions, without rewards."""
 
 import vd4rl_pomdp  # noqa: F401, before torch: it configures how torch's threads wait

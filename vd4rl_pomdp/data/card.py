@@ -1,6 +1,6 @@
-"""A set's data card: `card.md` and `card.png` beside its shards, all from what the set itself records.
+"""Write a data set's card, `card.md` and `card.png`, from what its own files record.
 
-V-D4RL's files are not needed to make one; its published figures are those in `published`.
+V-D4RL's files are not needed for it; published scores come from `data.folder.published_scores`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words, read_c
 
 FILM_FRAMES = 10
 LINES = 0.82
-"""Height of bars and lines; above is the legend's place."""
+"""Relative height of bars and lines; the legend is above."""
 HOW = {
     "random": "Uniformly random actions.",
     "medium": "The medium actor's sampled actions; the one that ships has about half of the expert's return.",
@@ -50,16 +50,16 @@ HOW = {
 
 
 def write_card(path: Path) -> Path:
-    """Describe a set in `card.md` and `card.png`, in its folder.
+    """Write `card.md` and `card.png` to a data set's folder.
 
     Args:
-        path: folder of all shards, collected here or published.
+        path: folder of all shards, collected by this package or published.
 
     Returns:
-        The card's file.
+        Path of card.md.
 
     Raises:
-        UserError: this is no folder, the set is damaged or a part of a published one, or the folder cannot be written.
+        UserError: `path` is not a folder or not writable, or the data set is damaged or incomplete.
     """
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
@@ -73,7 +73,7 @@ def write_card(path: Path) -> Path:
     returns = episode_returns(rows["reward"], starts)
     lengths = np.diff([*starts, len(rows["reward"])])
     scores = [row["bc"] for row in published_scores() if (row["env"], row["dataset"]) == names]
-    # of plain behaviour cloning: the published figure that is nearest to the set's own average
+    # plain behaviour cloning is the published score closest to the data's own mean return
     published = float(scores[0]) * SCORE_DIVISOR if scores else None
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
     text = _text(path, names, attributes, returns, lengths, published)
@@ -88,7 +88,7 @@ def write_card(path: Path) -> Path:
 def _film(
     shards: list[Path], counts: list[int], starts: np.ndarray, lengths: np.ndarray, returns: np.ndarray
 ) -> np.ndarray:
-    """(FILM_FRAMES, 3, S, S) frames, evenly spaced, of the episode with the median return."""
+    """Evenly spaced frames (FILM_FRAMES, 3, S, S) of the episode with the median return."""
     episode = int(np.argsort(returns)[len(returns) // 2])
     wanted = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
     offsets = np.cumsum([0, *counts])
@@ -161,7 +161,7 @@ def _text(
 
 
 def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
-    """Seed, actors, rendering, versions and commit, as the set's files record them, in Markdown."""
+    """Seed, actors, rendering, versions and commit from the data set's files, as Markdown by name."""
     if not attributes[0]:
         return {}
     first = attributes[0]

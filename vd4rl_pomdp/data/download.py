@@ -1,4 +1,4 @@
-"""Fetch the published 84-pixel sets by huggingface_hub: resumed, checked by SHA-256, equal files stored once."""
+"""Download V-D4RL's 84-pixel data sets with huggingface_hub: resumable, SHA-256 verified, equal files hard-linked."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ REPOSITORY = "conglu/vd4rl"
 
 
 def default_endpoint() -> str:
-    """The Hub, or the mirror of it that HF_ENDPOINT names, as for everything that uses huggingface_hub."""
+    """Address of the Hub: HF_ENDPOINT if set, as in huggingface_hub, else https://huggingface.co."""
     return os.environ.get("HF_ENDPOINT") or HUB
 
 
 def check_endpoint(endpoint: str, name: str) -> None:
-    """Raise UserError unless what a mirror is called, by the flag or variable `name`, is an address."""
+    """Raise UserError unless `endpoint`, given by the flag or variable `name`, is an http(s) address."""
     with suppress(ValueError):
         parts = urlsplit(endpoint)
         if parts.scheme in ("http", "https") and parts.hostname:
@@ -38,7 +38,7 @@ def check_endpoint(endpoint: str, name: str) -> None:
 
 
 def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:
-    """Raise UserError for a task or a quality of which no set is published."""
+    """Raise UserError for a task or quality without a published data set."""
     published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
     for task in tasks:
         refuse_unknown("task of published sets", task, published)
@@ -49,21 +49,21 @@ def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:
 def download(
     task: str, quality: str, destination: Path, endpoint: str | None = None, verify: bool = False
 ) -> list[Path]:
-    """Download one set into `destination/{task}/{quality}/84px`; what is there already is not fetched again.
+    """Download one data set into `destination/{task}/{quality}/84px`; existing files are not downloaded again.
 
     Args:
         task: task name.
         quality: one of `tasks.QUALITIES`.
-        destination: folder that holds all downloaded sets; a file that another set in it has is linked, not fetched.
-        endpoint: address of the mirror, up to and without `/datasets`; None: `default_endpoint`.
-        verify: also compute the SHA-256 of files that are at their places; otherwise their size is enough there.
+        destination: folder of all downloaded data sets; files equal to another data set's there are hard-linked.
+        endpoint: address of the Hub or a mirror, without `/datasets`; None: `default_endpoint`.
+        verify: also check the SHA-256 of existing files; by default only their size is checked.
 
     Returns:
-        The set's shards, all of them verified.
+        The data set's shards.
 
     Raises:
-        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, a full disk, or a set that
-            another process downloads.
+        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, a full disk, or another
+            process is downloading the data set.
     """
     check_published([task], [quality])
     endpoint = default_endpoint() if endpoint is None else endpoint
@@ -80,12 +80,12 @@ def download(
 
 
 def _is_there(file: RemoteFile, path: Path, verify: bool) -> bool:
-    """Only verified files get their final name, so the size suffices unless asked otherwise."""
+    """Whether a file is complete. Only verified files get their final name, so by default the size suffices."""
     return path.is_file() and path.stat().st_size == file.size and (not verify or sha256(path) == file.sha256)
 
 
 def _provide(file: RemoteFile, destination: Path, beside: Path, endpoint: str) -> None:
-    """Put a file at its place: an equal one of another set is linked, or it is fetched; verified."""
+    """Create a file at its target: link an equal one of another data set, or download it; both are verified."""
     target = file.target(destination)
     others = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
     twin = next((path for path in others if path != target and _is_there(file, path, verify=True)), None)
@@ -94,16 +94,16 @@ def _provide(file: RemoteFile, destination: Path, beside: Path, endpoint: str) -
         fresh.unlink(missing_ok=True)
         try:
             os.link(twin.resolve(), fresh)
-        except OSError:  # not every disk has links
+        except OSError:  # not every file system supports hard links
             shutil.copyfile(twin, fresh)
     target.parent.mkdir(parents=True, exist_ok=True)
     fresh.replace(target)
 
 
 def _fetch(file: RemoteFile, folder: Path, endpoint: str) -> Path:
-    """Download a file into a folder, where a cut download is resumed, and verify it."""
+    """Download a file into a folder, resuming an interrupted download, and verify it."""
     url = hf_hub_url(REPOSITORY, file.path, repo_type="dataset", endpoint=endpoint)
-    logging.getLogger("huggingface_hub.utils._http").setLevel(logging.ERROR)  # its retries: what comes of them is said
+    logging.getLogger("huggingface_hub.utils._http").setLevel(logging.ERROR)  # hide retries; failures are raised
     try:
         fetched = hf_hub_download(
             REPOSITORY,
@@ -111,11 +111,11 @@ def _fetch(file: RemoteFile, folder: Path, endpoint: str) -> Path:
             repo_type="dataset",
             local_dir=folder,
             endpoint=endpoint,
-            token=None if endpoint == default_endpoint().rstrip("/") else False,  # a user's token is for their own Hub
-            library_name="vd4rl-pomdp",  # what the Hub counts downloads by
+            token=None if endpoint == default_endpoint().rstrip("/") else False,  # never send a token to other hosts
+            library_name="vd4rl-pomdp",  # for the Hub's download statistics
         )
     except (HTTPError, OSError) as error:
-        if isinstance(error, OSError) and error.errno:  # the disk's; those of huggingface_hub have no number
+        if isinstance(error, OSError) and error.errno:  # from the disk; huggingface_hub's OSErrors have no errno
             raise
         reason = in_one_line(error.__cause__ or error)
         raise UserError(

@@ -1,4 +1,4 @@
-"""Does the environment show the pixels of the data? Canary frames against golden ones, and data against both."""
+"""Check that the environment renders the data's pixels: compare canary with golden frames, and data backgrounds."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from vd4rl_pomdp.envs.rendering import FrameCamera, frames_hash, gl_strings, muj
 
 GOLDEN = Path(__file__).parent / "golden.npz"
 CANARY = "walker_walk"
-"""Whose canary frames stand for a machine's rendering where the task has none."""
+"""Task whose canary frames are used for tasks without golden frames."""
 MAX_MEAN_DIFFERENCE = 0.25
-"""Largest mean absolute difference (of 255) that counts as the same pixels.
+"""Largest mean absolute difference (of 255) that counts as equal.
 
 Measured: 0.01 between mujoco 3.1.6 and 3.11.0 with the sky restored, 0.03 with the smaller shadow map, 1.4 to 2.1
-without the sky. Rasterisers of different vendors may differ along edges, hence the room above 0.03.
+without the sky. The margin above 0.03 allows for differences along edges between rasterisers of different vendors.
 """
 _OFF_BY = 8
 _STATIC_STD = 2.0
 
 
 def canary_frames(task: str, render: Render = "exact") -> np.ndarray:
-    """Frames of the golden file's states as this machine renders them: (F, 3, 84, 84) uint8."""
+    """The golden states rendered on this machine: (F, 3, 84, 84) uint8."""
     return _show_golden_states(task, _golden_env(task, render))
 
 
 def render_info(task: str = CANARY) -> dict[str, Any]:
-    """What rendered: versions, GL vendor and renderer, and the hash of the canary frames.
+    """Describe this machine's rendering: mujoco version, GL vendor and renderer, and the hash of the canary frames.
 
     Args:
-        task: name of what was rendered; one without golden frames has those of the CANARY, and one that is not
-            dm_control's the version of Gymnasium alone.
+        task: name of the task. For one without golden frames CANARY's are used; for one that is not dm_control's the
+            result is only Gymnasium's version.
     """
     if not isinstance(TASKS.get(task), DMCTask | None):
         return {"gymnasium": gymnasium.__version__}
@@ -53,7 +53,7 @@ def render_info(task: str = CANARY) -> dict[str, Any]:
 def compare(rendered: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
     """Mean absolute difference, share of pixels off by more than 8 of 255, and whether they count as equal.
 
-    Pixels are uint8, or floating point: a median may lie between two.
+    Pixels are uint8 or, for medians, floating point.
     """
     difference = np.abs(rendered.astype(np.float32) - reference)
     mean = float(difference.mean(dtype=np.float64))
@@ -65,15 +65,15 @@ def compare(rendered: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
 
 
 def check_parity(path: Path | None = None) -> dict[str, Any]:
-    """Compare canary frames with golden ones, and a set's static background with the environment's.
+    """Compare canary frames with golden ones, and a data set's static background with the environment's.
 
     Args:
-        path: a data set; None compares the canaries alone.
+        path: a data set; None: compare only the canaries.
 
     Returns:
-        `render`, `canary` (a comparison for every task of the benchmark), `background` (one, or None), and the verdict
-        `equal`: the background's where there is a set, whose renderer need not be the golden frames', else of all
-        canaries.
+        `render`, `canary` (a comparison per task), `background` (a comparison, or None), and `equal`: the background's
+        result if there is a data set (which may have been rendered differently from the golden frames), else whether
+        all canaries are equal.
     """
     canary = {task: compare(canary_frames(task), _golden()[f"{task}/frames"]) for task in golden_tasks()}
     background = None if path is None else _compare_background(path)
@@ -82,7 +82,7 @@ def check_parity(path: Path | None = None) -> dict[str, Any]:
 
 
 def _compare_background(path: Path) -> dict[str, Any]:
-    """Median frames of data and environment, on the pixels that are static in both."""
+    """Compare the median frames of data and environment on the pixels that are static in both."""
     dataset = open_dataset(path)
     if dataset.task is None:
         raise UserError(f"{path}: cannot tell the task; put the set in a folder named after it, such as walker_walk/")
@@ -109,7 +109,7 @@ def _wandering_frames(task: str, size: int, count: int = 100) -> np.ndarray:
 
 
 def golden_tasks() -> list[str]:
-    """Names of the tasks that have golden frames."""
+    """Names of the tasks with golden frames."""
     return [name.partition("/")[0] for name in _golden() if name.endswith("/frames")]
 
 
@@ -129,6 +129,6 @@ def _show_golden_states(task: str, env: DMCEnv) -> np.ndarray:
 
 @cache
 def _golden() -> dict[str, np.ndarray]:
-    """`<task>/physics` states and the `<task>/frames` that mujoco 3.1.6 shows for them, as Mesa's software draws."""
+    """`<task>/physics`: states, `<task>/frames`: their frames by mujoco 3.1.6 with Mesa's software renderer."""
     with np.load(GOLDEN) as file:
         return dict(file)

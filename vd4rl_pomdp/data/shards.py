@@ -1,4 +1,4 @@
-"""Write a set's shards, whatever they hold: each one whole, what is there already left alone, the record last."""
+"""Write the shards of any collected data set: atomically, keeping existing shards, with the provenance file last."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Shard:
 
     path: Path
     jobs: list[Any]
-    """Its episodes."""
+    """One job per episode."""
     attributes: dict[str, Any]
 
 
@@ -43,19 +43,19 @@ def collect_set(
     title: tuple[str, str],
     task: str | None,
 ) -> None:
-    """Write what is missing of a set: collection.json first, which says what it is, then shards, provenance.json last.
+    """Write a data set's missing files: collection.json with its settings first, then shards, then provenance.json.
 
     Args:
-        out: folder of the set.
-        settings: what tells it from others.
-        shards: all shards of the set.
-        roll_out: plays a job; its rows by key.
-        workers: processes, 0 for every core.
-        title: what is going on, and the unit of a job.
-        task: name of the task or maze, for what rendered it; None: nothing is rendered.
+        out: folder of the data set.
+        settings: the settings that identify it.
+        shards: all shards of the data set.
+        roll_out: plays a job and returns its rows by key.
+        workers: number of processes; 0: one per core.
+        title: title of the progress bar, and its unit, such as ("collect", "episodes").
+        task: name of the task or maze, to record what rendered it; None: nothing is rendered.
 
     Raises:
-        UserError: the folder holds something else, or shards that another machine or other code of its parts made.
+        UserError: the folder holds something else, or its shards were rendered differently or made by other code.
     """
     with owned(out):
         missing = [shard for shard in shards if not shard.path.exists()]
@@ -83,7 +83,7 @@ def collect_set(
 
 
 def _claim(out: Path, settings: dict[str, Any], stored: dict[str, Any], whole: bool) -> None:
-    """Raise UserError unless a folder is free, or holds this set, begun by this code; a whole one stays what it is."""
+    """Raise UserError unless a folder is empty or holds this data set; an unfinished one must be of the same code."""
     if not stored and holds_anything(out):
         raise UserError(f"{out}: is not empty and holds no collected set; choose another folder")
     if stored and (others := differing(stored, settings)):
@@ -96,7 +96,7 @@ def _claim(out: Path, settings: dict[str, Any], stored: dict[str, Any], whole: b
 
 
 def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]:
-    """Who draws here; raises UserError if the shards that are there show other pixels."""
+    """This machine's renderer; UserError if existing shards were rendered with other pixels."""
     from vd4rl_pomdp.data.parity import render_info
 
     now, before = render_info(task), stored.get("rendered_by", {})
@@ -110,5 +110,5 @@ def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]
 
 
 def differing(stored: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
-    """Names of the settings that a collection.json has otherwise."""
+    """Names of the settings that differ from a collection.json's."""
     return sorted(name for name, value in settings.items() if stored.get(name) != value)
