@@ -124,7 +124,7 @@ def actions_fill_their_bounds(name: str) -> None:
 
 
 def _given(env: PixelEnv, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make a step; the bounds of the environment's own actions, and what it was given, all (A,)."""
+    """Take one step; returns the environment's action bounds (low, high) and the action it received, each (A,)."""
     inner: Any = env.env if isinstance(env.task, GymnasiumTask) else env.simulator  # type: ignore[attr-defined]
     given: list[np.ndarray] = []
     step = inner.step

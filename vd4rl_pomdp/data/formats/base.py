@@ -107,7 +107,7 @@ def picture_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
 
 
 def as_frames(pictures: np.ndarray) -> np.ndarray:
-    """(T, ...) uint8 pictures whose size `picture_size` tells as (T, 3, H, W): of a stack the newest frame."""
+    """Convert (T, ...) uint8 images, of shapes that `picture_size` accepts, to (T, 3, H, W); newest frame of stacks."""
     if pictures.ndim == 3:
         pictures = pictures[..., None]
     frames = np.moveaxis(pictures, -1, 1) if pictures.shape[-1] in _CHANNELS else pictures

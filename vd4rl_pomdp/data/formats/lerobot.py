@@ -1,12 +1,12 @@
-"""LeRobot's format, version 3: rows in parquet, pictures in them as PNG or beside them as video.
+"""LeRobot's format, version 3: rows in parquet, with images as PNG in the rows or as separate videos.
 
-    meta/  info.json  tasks.parquet  stats.json  episodes/chunk-000/file-000.parquet: a row an episode, where it lies
-    data/chunk-000/file-000.parquet         a row a step: o_t with a_t, and as `next.*` what a_t led to
+    meta/  info.json  tasks.parquet  stats.json  episodes/chunk-000/file-000.parquet: one row per episode, its location
+    data/chunk-000/file-000.parquet         one row per step: o_t, a_t, and the outcome of a_t as `next.*`
     videos/KEY/chunk-000/file-000.mp4       many episodes, one after another
 
-A row has a picture and an action, so what the last action led to needs a row of its own. Most sets have none, and their
-last actions and rewards cannot be used. Sets that are written here have one, which repeats the last action, as
-LeRobot's own evaluation does; they are known by their column `next.discount`.
+A row holds an image and an action, so an episode's final observation needs an extra row. Most data sets lack it, and
+their last actions and rewards cannot be used. Data sets written here have it, with the last action repeated, as in
+LeRobot's own evaluation; their column `next.discount` identifies them.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ _CHUNK = 1000
 _FILE_MB = 100
 _FPS = 20
 _CODEC = {"crf": "18", "preset": "veryfast", "tune": "zerolatency", "threads": "1", "g": "2", "bf": "0"}
-"""H.264 in which every second frame stands alone, as in LeRobot's own videos, for access in any order; looking ahead
-and dividing such small pictures among threads would cost half as much again, for the same size."""
+"""H.264 with a keyframe every second frame, for random access, as in LeRobot's own videos. Lookahead and threads would
+take half as long again for such small images, at the same size."""
 _arrow, _parquet = partial(library, "pyarrow", _EXTRA), partial(library, "pyarrow.parquet", _EXTRA)
 
 
 def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
-    """A set on disk, of which no more than an episode and a row group of a file is held."""
+    """Open a data set on disk; reading holds at most one episode and one row group in memory."""
     folder, pq = Path(path), _parquet()
     info = _info(folder)
     features, episodes = info["features"], _episodes(pq, folder, info)
@@ -128,7 +128,7 @@ def _stored(
 
 
 def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
-    """Bounds of a set's actions, if they pass 1, and notes on what is left out of it or is not there."""
+    """Action bounds, if actions exceed [-1, 1], and warnings about unusable or missing values."""
     lows, highs, unused, lost, notes = [], [], 0, 0.0, []
     for file in files:
         table = pq.read_table(file, columns=["episode_index", "action", *wanted])
@@ -138,7 +138,7 @@ def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray |
         lows.append(action.min(0))
         highs.append(action.max(0))
         last = np.flatnonzero(np.diff(table["episode_index"].to_numpy(), append=-1))
-        if "next.done" in wanted:  # a row after the one that ended the episode is there for its picture alone
+        if "next.done" in wanted:  # a row after the terminal one only holds the final image
             last = last[~table["next.done"].to_numpy()[np.maximum(last - 1, 0)]]
         unused += len(last)
         if "next.reward" in wanted:
@@ -174,7 +174,7 @@ def _decoded(pictures: np.ndarray) -> np.ndarray:
 
 
 def _stacked(pictures: list[np.ndarray]) -> np.ndarray:
-    """(H, W, 3) pictures as (T, 3, H, W), copied once: transposed after stacking they would be copied twice later."""
+    """Stack (H, W, 3) images to (T, 3, H, W) with a single copy; transposing after stacking would need another."""
     out = np.empty((len(pictures), 3, *pictures[0].shape[:2]), np.uint8)
     return np.stack([one.transpose(2, 0, 1) for one in pictures], out=out)
 
@@ -212,7 +212,7 @@ def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> Episode
 
 
 def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = False) -> list[str]:
-    """A set that `LeRobotDataset(NAME, root=FOLDER)` loads; pictures as PNG in the rows, or as H.264 beside them."""
+    """Write a data set for `LeRobotDataset(NAME, root=FOLDER)`, with images as PNG in the rows or as H.264 videos."""
     size, end, files = source.frame_shape[0], 0, 0
     if video and size % 2:
         raise UserError(f"video needs an even height and width, not {size}: pass --size, or take `lerobot`")
@@ -271,7 +271,7 @@ def _columns(rows: EpisodeArrays, number: int, begin: int) -> dict[str, np.ndarr
 
 
 def _table(columns: dict[str, np.ndarray], files: list[bytes]) -> Any:
-    """Rows as they are stored: a column of width 1 holds numbers, not lists of one; PNG files, if there are any."""
+    """Columns as an arrow table: width 1 as numbers, not one-element lists; `files` are PNG images, if any."""
     arrow = _arrow()
     arrays = {name: arrow.array(values.ravel()) for name, values in columns.items()}
     for name, values in columns.items():

@@ -1,8 +1,8 @@
 """Minari's data sets, by its own library: reads any of its storage formats, writes HDF5.
 
-A set is a folder with a `data` folder in it, or the name that Minari knows it by. An episode has one observation more
-than actions, a_t standing beside the o_t that it follows. Pictures are written as (3, S, S), which Minari keeps to the
-byte; (H, W, 3), what most environments show, it stores as JPEG unless `jpeg_encoding=False` was passed.
+A data set is a folder with a `data` folder in it, or a name registered with Minari. An episode has one more observation
+than actions, with a_t aligned to o_t. Images are written as (3, S, S), which Minari stores losslessly; it stores
+(H, W, 3), the shape of most environments, as JPEG unless `jpeg_encoding=False` was passed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _KEY = "vd4rl_pomdp"
 
 
 def read(source: str, picture: str | None) -> SourceSet:
-    """Open a set by its folder or its name."""
+    """Open a data set by folder or name."""
     minari, storage = library("minari", "minari"), library("minari.dataset.minari_storage", "minari")
     folder = next((f for f in (Path(source), Path(source, "data")) if (f / "metadata.json").is_file()), None)
     try:
@@ -106,7 +106,7 @@ def _task(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
 
 
 def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
-    """Write a set that Minari loads by its name where `out` lies in Minari's own folder, and by its path elsewhere."""
+    """Write a data set that Minari loads by name if `out` is in Minari's own folder, else by path."""
     minari, storage = library("minari", "minari"), library("minari.dataset.minari_storage", "minari")
     home = library("minari.storage.datasets_root_dir", "minari").get_dataset_path().resolve()
     name = out.resolve().relative_to(home).as_posix() if out.resolve().is_relative_to(home) else out.name
@@ -114,7 +114,7 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     if not matched or not matched["version"]:
         raise UserError(f"{out}: Minari's names end in a version: call the folder {out.name or 'walker'}-v0")
     folder.mkdir()
-    # An episode's first row is all that tells widths; (3, S, S) is no picture for any version, so it is never encoded.
+    # Dimensions come from the first episode. Minari does not treat (3, S, S) as an image, so it is never JPEG-encoded.
     first = next(source.read(0))
     pictures = gymnasium.spaces.Box(0, 255, first[FRAMES_KEY].shape[1:], np.uint8)
     actions = gymnasium.spaces.Box(-1.0, 1.0, first["action"].shape[1:], np.float32)

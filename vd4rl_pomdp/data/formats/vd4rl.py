@@ -22,7 +22,7 @@ from vd4rl_pomdp.data.shards import EpisodeArrays
 
 
 def read_shards(path: str, picture: str | None = None) -> SourceSet:
-    """A set of this package's own format, of which no more than an episode and a block is held."""
+    """Open a data set in this package's format; reading holds at most one episode and one block in memory."""
     folder = Path(path)
     shards = shard_paths(folder)
     size = read_frame_size(shards)
@@ -73,7 +73,7 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
 
 
 def _cut_short(folder: Path, episodes: int, task: str | None, quality: str | None) -> list[str]:
-    """A warning for a 64-pixel set as V-D4RL's mirror has it: not all episodes of the set that its paper describes."""
+    """Warn if a 64-pixel data set has fewer episodes than V-D4RL's paper states, as those on its mirror do."""
     if "64px" not in folder.resolve().parts or episodes > 100 or None in (task, quality):
         return []
     expert = " of the expert alone" if quality == "medium_expert" else ""
