@@ -1,7 +1,7 @@
-"""Sets of other formats in and out, episode by episode: `data import` and `data export`.
+"""Convert data sets from and to other formats, episode by episode: `data import` and `data export`.
 
-An import writes shards as `data collect` does, each of them whole, and goes on where it was cut. An export is written
-into a hidden folder beside the named one and renamed when it is whole; a cut one begins anew.
+An import writes shards like `data collect` and resumes if interrupted. An export is written to a hidden folder next to
+the target and renamed at the end; an interrupted export starts over.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from vd4rl_pomdp.runs.outputs import owned, refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 _SHARD_ROWS = 5_000
-"""Rows of a shard, about: as many are in memory at once."""
+"""Approximate number of rows per shard, which is also how many are in memory at once."""
 _ROUNDING = 1e-5
-"""By how much actions may pass their bounds unseen: float32 rounds on the way."""
+"""Tolerance for actions beyond their bounds, for float32 rounding."""
 
 
 def import_set(
@@ -47,20 +47,20 @@ def import_set(
     picture: str | None = None,
     clip_actions: bool = False,
 ) -> list[Path]:
-    """Write a set of another format as one of this package's, or what is missing of it; returns its shards.
+    """Convert a data set of another format to this package's, or only its missing shards; returns its shards.
 
     Args:
-        name: the format's, in `FORMATS`.
-        source: path or name of the set.
+        name: name of the format in `FORMATS`.
+        source: path or name of the data set.
         out: folder to write.
-        task: the task's name, where the source does not tell it or tells another one.
-        quality: name of the behaviour that made the data.
-        size: height and width to which pictures are resized, by area; None: their own.
-        picture: which observation holds the pictures, where there are several.
+        task: task name, if the source does not state it or to override it.
+        quality: name of the behaviour policy.
+        size: height and width to resize images to, by area averaging; None: no resizing.
+        picture: name of the observation that holds the images, if there are several.
         clip_actions: whether actions outside the source's bounds are clipped; otherwise they are refused.
 
     Raises:
-        UserError: the source is missing, damaged or holds no pictures, actions pass their bounds, or the folder holds
+        UserError: the source is missing, damaged or has no images, actions are out of bounds, or the folder holds
             something else.
     """
     refuse_inside(out)
@@ -69,7 +69,7 @@ def import_set(
         if not opened.episodes:
             raise UserError("holds no episodes")
     own = next((value for value in opened.record.values() if isinstance(value, str)), name)
-    # the name of what nothing tells a task of; of files, too
+    # without a known task, its label (also used in file names) is made from the source's own name
     label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
     _tell(opened.notes)
     settings: dict[str, Any] = {
@@ -105,10 +105,10 @@ def import_set(
 
 
 def export_set(name: str, path: Path, out: Path, size: int | None = None) -> None:
-    """Write a set of this package's in another format; `size` as in `import_set`.
+    """Convert a data set of this package to another format; `size` as in `import_set`.
 
     Raises:
-        UserError: the format can only be read, the set is damaged, or something is in the way.
+        UserError: the format is read-only, the data set is damaged, or `out` is not empty.
     """
     form = FORMATS.named(name)
     if form.write is None:
@@ -128,9 +128,9 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
             yield rows
             progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
-    # its lock keeps the hidden folder of another process from being removed
+    # `owned` locks the hidden folder, so that no other process removes it
     with _without_a_trace(hidden, True), disk_errors(out), owned(hidden), progress:
-        shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was killed
+        shutil.rmtree(hidden / "set", ignore_errors=True)  # left by a killed process
         try:
             lost = form.write(hidden / "set", out, replace(opened, read=read))
             if out.is_dir():
@@ -143,7 +143,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
 
 @contextmanager
 def _without_a_trace(folder: Path, ours: bool = False) -> Iterator[None]:
-    """In the end a folder and those above it are removed if they are empty and were made within, or it is `ours`."""
+    """On exit remove `folder` and its parents if empty and created in the block (`folder` always, if `ours`)."""
     made = [one for one in (folder, *folder.parents) if not one.exists() or (ours and one == folder)]
     try:
         yield
@@ -155,26 +155,27 @@ def _without_a_trace(folder: Path, ours: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _telling(place: str) -> Iterator[None]:
-    """What a format's reader or its library raises, as a sentence that says where."""
+    """Turn errors of a format's reader or library into one-line UserErrors that name `place`."""
     try:
         yield
     except UserError as error:
         raise type(error)(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
-    except Exception as error:  # of any kind: libraries trust what they read
+    except Exception as error:  # libraries do not validate their input, so damaged files raise anything
         raise system_error(Path(place), error) or UserError(
             f"{place}: cannot be read as this format ({in_one_line(error) or type(error).__name__})"
         ) from error
 
 
 class _Reader:
-    """Rows of an episode by its number; they are asked for in order, but for those that are there already."""
+    """Returns an episode's rows by number; a number that does not follow the last one (after a shard that exists)
+    starts a new pass over the source."""
 
     def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
         self._name, self._source, self._clip = name, source, clip
         self._next = -1
         self._episodes: Iterator[EpisodeArrays] = iter(())
         self._layout: dict[str, tuple[int, ...]] = {}
-        self._last = np.zeros(0, np.uint8)  # the last picture of the episode before
+        self._last = np.zeros(0, np.uint8)  # last image of the previous episode
         self._clipped = self._read = self._still = self._joined = 0
         self.asked = False
 
@@ -206,7 +207,7 @@ class _Reader:
             return rows
 
     def notes(self) -> Iterator[str]:
-        """What the episodes that were read have in common."""
+        """Warnings about the episodes read, such as clipped actions."""
         if self._clipped:
             yield f"{self._clipped} actions lay outside their bounds and were clipped"
         if self._still and self._still == self._read:
@@ -215,7 +216,7 @@ class _Reader:
             yield "every episode begins with the last picture of the one before: its first step crosses a reset"
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:
-        """Actions in [-1, 1]; those of a first row stay zero."""
+        """Actions rescaled to [-1, 1]; a first row's stays zero."""
         low, high = self._source.action_low, self._source.action_high
         scaled = action.astype(np.float32)
         if low is not None and high is not None and not ((low == -1).all() and (high == 1).all()):
@@ -235,7 +236,7 @@ class _Reader:
 
 
 def _resized(source: SourceSet, size: int | None) -> SourceSet:
-    """A source of square pictures, made so where `size` says how large."""
+    """The source with square frames, resized to `size` if given; UserError if frames are not square and it is not."""
     (height, width), (low, high) = source.frame_shape, FRAME_SIZES
     if size is None:
         if height != width or not low <= height <= high:

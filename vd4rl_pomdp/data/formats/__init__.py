@@ -20,4 +20,4 @@ FORMATS: Registry[DataFormat] = Registry(
     lambda part: isinstance(part, DataFormat),
     "a vd4rl_pomdp.data.formats.base.DataFormat",
 )
-"""All formats. Packages offer theirs in the group of entry points `vd4rl_pomdp.formats`."""
+"""All formats. Other packages add theirs through the entry point group `vd4rl_pomdp.formats`."""

@@ -1,4 +1,4 @@
-"""What a foreign format is to `data import` and `data export`: a reader of episodes, and where one can be, a writer."""
+"""Interface of formats for `data import` and `data export`: a reader of episodes and, optionally, a writer."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from vd4rl_pomdp.data.shards import EpisodeArrays
 
 @dataclass(frozen=True)
 class SourceSet:
-    """An opened set, whose episodes are read one at a time."""
+    """An opened data set whose episodes are read one at a time."""
 
     episodes: int
     rows: int
-    """Rows in all, or about as many: they decide how many episodes a shard gets."""
+    """Total number of rows, which may be approximate; it determines how many episodes go into a shard."""
     frame_shape: tuple[int, int]
     """Height and width of the pictures."""
     read: Callable[[int], Iterator[EpisodeArrays]]
-    """Yields the rows of all episodes from a number on, as `rows_of` makes them, but for pictures of any height and
-    width, and actions in the source's own units."""
+    """Yields the rows of all episodes from a given number on, as by `rows_of`, but with images of any height and width,
+    and actions in the source's own units."""
     record: dict[str, Any]
-    """JSON values that tell this source from another, its name first, such as size: a cut import goes on only with
-    equal ones."""
+    """JSON values that identify the source, name first, such as its size; an interrupted import resumes only if they
+    are equal."""
     action_low: np.ndarray | None = None
     action_high: np.ndarray | None = None
-    """(A,) bounds of the actions; None where nothing tells them: then they must lie in [-1, 1]."""
+    """(A,) action bounds; None if unknown: actions must then lie in [-1, 1]."""
     task: str | None = None
     quality: str | None = None
     notes: list[str] = field(default_factory=list)
-    """What a user must know of it, one line each."""
+    """Warnings for the user, one line each."""
 
 
 @dataclass(frozen=True)
 class DataFormat:
-    """A format of other libraries."""
+    """A data format of another library."""
 
     summary: str
-    """One line that says what it is."""
+    """One-line description."""
     read: Callable[[str, str | None], SourceSet]
-    """Opens a source: its path or name, and which of its observations holds the pictures (None: the only one)."""
+    """Opens a source, given its path or name and the observation that holds the images (None: the only one)."""
     write: Callable[[Path, Path, SourceSet], list[str]] | None = None
-    """Writes a set into a folder that is not there yet, and that will be renamed to the second: (folder, final place,
-    set). Pictures are square, actions in [-1, 1]. Returns what the format could not keep, one line each."""
+    """Called with (folder, final place, set): writes the set to a new folder, which is then renamed to the final place.
+    Images are square, actions in [-1, 1]. Returns what the format could not store, one line each."""
 
 
 def rows_of(
@@ -60,15 +60,14 @@ def rows_of(
     complete: bool = True,
     physics: np.ndarray | None = None,
 ) -> EpisodeArrays:
-    """An episode whose a_t and r_t are numbered like the o_t that they follow, as rows, which hold a_{t-1} and r_{t-1}.
+    """Convert an episode with a_t and r_t aligned to o_t into this package's rows, which store a_{t-1} and r_{t-1}.
 
     Args:
         frames: (T + 1, 3, H, W) uint8, o_0 to o_T.
         action: (T, A), a_0 to a_{T-1}.
         reward: (T,).
-        terminated: whether the task itself ended (discount 0, which is 1 after a time limit): with the last of the
-            steps, or (T,) for each.
-        complete: whether the episode ended at all; False: its source was cut.
+        terminated: whether the task terminated (discount 0; 1 after a time limit): at the last step, or (T,) per step.
+        complete: whether the episode ended at all; False: the recording was cut off.
         physics: (T + 1, P) simulator states.
     """
     steps = len(action)
@@ -92,12 +91,12 @@ def rows_of(
 
 
 def one_hot(action: np.ndarray, number: int) -> np.ndarray:
-    """(T,) actions from 0 to number - 1 as (T, number) float32: 1 for the one that was taken, -1 for all others."""
+    """Encode (T,) discrete actions in 0..number-1 as (T, number) float32: 1 for the action taken, -1 for the others."""
     return np.where(np.arange(number) == action[:, None], np.float32(1), np.float32(-1))
 
 
 _CHANNELS = (1, 3, 6, 9, 12)
-"""Grey, or red, green and blue of each frame of a stack."""
+"""Valid channel counts: grey, or RGB times up to 4 stacked frames."""
 
 
 def picture_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
@@ -116,11 +115,11 @@ def as_frames(pictures: np.ndarray) -> np.ndarray:
 
 
 def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[str, tuple[int, int]]:
-    """Which observation holds the pictures, and their size: the one that the user names, else the only one that can.
+    """Name and image size of the observation with the images: the user's choice, else the only candidate.
 
     Args:
-        shapes: of all uint8 observations, by name.
-        picture: the user's choice.
+        shapes: shapes of all uint8 observations, by name.
+        picture: the user's choice, or None.
     """
     known = {name: size for name, shape in shapes.items() if (size := picture_size(shape))}
     if not known:
@@ -131,7 +130,7 @@ def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[
 
 
 def library(name: str, extra: str) -> Any:
-    """A module that only one format needs; UserError, naming the extra that brings it, if it is not installed."""
+    """Import a format's optional dependency; UserError naming the extra to install if it is missing."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -81,7 +81,7 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
 
 def _info(folder: Path) -> dict[str, Any]:
-    """What meta/info.json tells."""
+    """Read and check meta/info.json."""
     path = folder / "meta" / "info.json"
     if not path.is_file():
         raise UserError("has no meta/info.json, so it is no LeRobot set on this disk; `hf download` fetches one")
@@ -96,7 +96,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _episodes(pq: Any, folder: Path, info: dict[str, Any]) -> dict[str, list[Any]]:
-    """Columns of meta/episodes: where each episode lies, in order."""
+    """Columns of meta/episodes, which locate each episode, in order."""
     index = sorted(folder.glob("meta/episodes/*/*.parquet"))
     names = [name for file in index[:1] for name in pq.read_schema(file).names if not name.startswith("stats/")]
     tables = [pq.read_table(file, columns=names) for file in index]
@@ -110,7 +110,7 @@ def _episodes(pq: Any, folder: Path, info: dict[str, Any]) -> dict[str, list[Any
 def _stored(
     data: list[Path], lengths: list[int], columns: list[str], first: int
 ) -> Iterator[tuple[int, EpisodeArrays]]:
-    """Numbers of the episodes from one on, and their columns; `data` and `lengths` tell each one's file and rows."""
+    """Yield (number, columns) of episodes from `first` on; `data` and `lengths` are each episode's file and rows."""
     for path, numbers in groupby(range(data.index(data[first]), len(data)), data.__getitem__):
         with _parquet().ParquetFile(path) as file:
             batches = file.iter_batches(256, columns=columns)
@@ -157,7 +157,7 @@ def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray |
 
 
 def _dense(column: Any) -> np.ndarray:
-    """Values of an arrow array: (N,) numbers, (N, D) of lists of them, or (N,) bytes of pictures."""
+    """Values of an arrow array: (N,) numbers, (N, D) numbers from lists, or (N,) bytes of encoded images."""
     if hasattr(column, "field"):
         return np.array(column.field("bytes").to_pylist(), object)
     if hasattr(column, "values"):
@@ -166,7 +166,7 @@ def _dense(column: Any) -> np.ndarray:
 
 
 def _decoded(pictures: np.ndarray) -> np.ndarray:
-    """(T, 3, H, W) uint8 of (T,) files."""
+    """Decode (T,) image files to (T, 3, H, W) uint8."""
     if None in pictures:
         raise UserError("its pictures lie in other files than data/, which are not followed")
     opened = (Image.open(io.BytesIO(one)) for one in pictures)
@@ -180,9 +180,9 @@ def _stacked(pictures: list[np.ndarray]) -> np.ndarray:
 
 
 def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
-    """(T, 3, H, W) uint8 pictures of a video at increasing times, in seconds of the file."""
+    """Decode a video's frames (T, 3, H, W) uint8 at increasing times, in seconds of the file."""
     av = library("av", _EXTRA)
-    # One for all frames: `frame.to_ndarray(format=...)` makes a new one each time, which is four times as slow.
+    # Shared by all frames: `frame.to_ndarray(format=...)` creates one per frame, which is four times slower.
     converter = av.video.reformatter.VideoReformatter()
     pictures: list[np.ndarray] = []
     try:
@@ -202,7 +202,7 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
 
 
 def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:
-    """LeRobot's rows of an episode as this package's."""
+    """Convert an episode's LeRobot rows to this package's."""
     count = len(frames)
     done, truncated = (name in told and bool(told[name][-2:-1].any()) for name in ("next.done", "next.truncated"))
     reward, action = told.get("next.reward", np.zeros(count)).reshape(count)[:-1], told["action"].reshape(count, -1)
@@ -252,7 +252,7 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
 
 
 def _columns(rows: EpisodeArrays, number: int, begin: int) -> dict[str, np.ndarray]:
-    """An episode's rows by LeRobot's names: o_t with a_t and what it led to; the last row repeats the last action."""
+    """LeRobot's columns of an episode: o_t, a_t and its outcome `next.*`; the last row repeats the last action."""
     frame = np.arange(len(rows["reward"]))
     after = np.minimum(frame + 1, frame[-1])
     return {
@@ -260,7 +260,7 @@ def _columns(rows: EpisodeArrays, number: int, begin: int) -> dict[str, np.ndarr
         "next.reward": np.append(rows["reward"][1:], 0.0),
         "next.done": (rows["step_type"] == StepType.LAST)[after],
         _OWN: rows["discount"][after].astype(np.float64),
-        # not called `observation.*`, all of which LeRobot's policies are given
+        # not called `observation.*`, since LeRobot's policies read all of those
         **{name: rows[name] for name in ("physics",) if name in rows},
         "timestamp": (frame / _FPS).astype(np.float32),
         "frame_index": frame,
@@ -289,7 +289,7 @@ def _save(path: Path, tables: list[Any]) -> None:
 
 
 def _describe(folder: Path, source: SourceSet, columns: EpisodeArrays, told: list[dict[str, Any]], video: bool) -> None:
-    """What meta/ holds beside the episodes."""
+    """Write the files in meta/ other than the episodes."""
     size, task = source.frame_shape[0], source.task or _NO_TASK
     coded = {"height": size, "width": size, "codec": "h264", "pix_fmt": "yuv420p", "fps": _FPS, "channels": 3}
     info = {f"video.{name}": value for name, value in (coded | {"is_depth_map": False}).items()} | {"has_audio": False}
@@ -322,7 +322,7 @@ def _describe(folder: Path, source: SourceSet, columns: EpisodeArrays, told: lis
 
 
 def _stats(values: np.ndarray) -> dict[str, list[Any]]:
-    """Statistics of a column over rows, or of the channels of (N, 3, H, W) pictures, which count from 0 to 1."""
+    """Statistics of a column over rows, or per channel of (N, 3, H, W) images, scaled to [0, 1]."""
     pixels = values.ndim == 4
     flat = values.swapaxes(0, 1).reshape(3, -1) if pixels else values.reshape(len(values), -1).T.astype(float)
     told = {"min": flat.min(1), "max": flat.max(1), "mean": flat.mean(1), "std": flat.std(1)}
@@ -331,7 +331,7 @@ def _stats(values: np.ndarray) -> dict[str, list[Any]]:
 
 
 def _joined(told: list[dict[str, Any]], prefix: str) -> dict[str, list[Any]]:
-    """Statistics of all episodes together."""
+    """Combine the episodes' statistics into those of the whole data set."""
     least, most, means, std, count = (
         np.array([one[prefix + kind] for one in told], float) for kind in ("min", "max", "mean", "std", "count")
     )
@@ -343,7 +343,7 @@ def _joined(told: list[dict[str, Any]], prefix: str) -> dict[str, list[Any]]:
 
 
 def _png_encoder(size: int) -> Callable[[np.ndarray], bytes]:
-    """What makes a PNG file of a picture: FFmpeg's, which takes half the time of Pillow's for the same size."""
+    """A function that encodes an image as PNG, by FFmpeg, which is twice as fast as Pillow for the same file size."""
     av = library("av", _EXTRA)
     coder = av.CodecContext.create("png", "w")
     coder.height, coder.width, coder.pix_fmt, coder.time_base = size, size, "rgb24", Fraction(1, _FPS)

@@ -1,4 +1,4 @@
-"""Minari's sets, by its own library: any of its storages is read, HDF5 is written.
+"""Minari's data sets, by its own library: reads any of its storage formats, writes HDF5.
 
 A set is a folder with a `data` folder in it, or the name that Minari knows it by. An episode has one observation more
 than actions, a_t standing beside the o_t that it follows. Pictures are written as (3, S, S), which Minari keeps to the
@@ -23,7 +23,7 @@ from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chos
 from vd4rl_pomdp.data.shards import EpisodeArrays
 
 _KEY = "vd4rl_pomdp"
-"""What an export adds to Minari's metadata: task and quality of the set."""
+"""Metadata key of an export, for task and quality of the data set."""
 
 
 def read(source: str, picture: str | None) -> SourceSet:
@@ -87,7 +87,7 @@ def read(source: str, picture: str | None) -> SourceSet:
 
 
 def _leaves(space: gymnasium.Space[Any], name: str = "") -> Iterator[tuple[str, gymnasium.spaces.Box]]:
-    """Spaces of single arrays within a space, by the keys that lead to them."""
+    """Yield the Box spaces nested in a space, with their paths, such as "image/front"."""
     if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
         parts = space.spaces.items() if isinstance(space, gymnasium.spaces.Dict) else enumerate(space.spaces)
         for key, part in parts:
@@ -97,7 +97,7 @@ def _leaves(space: gymnasium.Space[Any], name: str = "") -> Iterator[tuple[str, 
 
 
 def _task(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
-    """The task whose environment recorded a set."""
+    """The registered task with the environment that recorded the data set, None if there is none."""
     if spec is None:
         return None
     own = {name for name, task in TASKS.items() if isinstance(task, GymnasiumTask) and task.environment == spec.id}

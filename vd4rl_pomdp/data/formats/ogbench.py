@@ -1,6 +1,6 @@
 """OGBench's visual sets: one compressed `.npz` file, read as a stream.
 
-Row t holds o_t, a_t and `terminals`, 1 with the last o_T of an episode, whose action led nowhere. There are no rewards.
+Row t holds o_t, a_t and `terminals`, which is 1 at an episode's last row, whose action is unused. There are no rewards.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def read(source: str, picture: str | None) -> SourceSet:
     with zipfile.ZipFile(path) as file:
         if lacking := {"observations", "actions", "terminals"} - {Path(name).stem for name in file.namelist()}:
             raise UserError(f"has no {min(lacking)!r}, so it is no set of OGBench")
-    with np.load(path) as file:  # which reads what is asked for
+    with np.load(path) as file:  # loads only the arrays that are accessed
         action, terminals = file["actions"], file["terminals"].astype(bool)
     with _observations(path) as (_, shape, dtype):
         _, size = chosen({"observations": shape[1:]} if dtype == np.uint8 else {}, picture)

@@ -1,4 +1,4 @@
-"""V-D4RL's two formats: HDF5 shards, which are this package's own, and the `.npz` episodes of its 64-pixel sets.
+"""V-D4RL's two formats: HDF5 shards, which this package also uses, and the `.npz` episodes of its 64-pixel data sets.
 
 An episode's file holds `image` (T + 1, S, S, 3) uint8, `action`, `reward`, `discount`, `is_first`, `is_last` and
 `is_terminal`, as DreamerV2 reads them; rows are numbered as in the shards. Its name ends in the number of rows.
@@ -49,7 +49,7 @@ def read_shards(path: str, picture: str | None = None) -> SourceSet:
 
 
 def read_npz(path: str, picture: str | None = None) -> SourceSet:
-    """A folder of episodes, one file each, in the order of their names."""
+    """Open a folder of episodes, one file each, ordered by name."""
     folder = Path(path)
     files = sorted(folder.glob("*.npz"))
     if not files:
@@ -84,7 +84,7 @@ def _cut_short(folder: Path, episodes: int, task: str | None, quality: str | Non
 
 
 def _episode(path: Path) -> EpisodeArrays:
-    """The rows of one file."""
+    """Read the rows of one file."""
     try:
         with np.load(path) as file:
             stored = {key: file[key] for key in file.files}
@@ -109,7 +109,7 @@ def _episode(path: Path) -> EpisodeArrays:
 
 
 def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
-    """One file for each episode; the names sort in their order."""
+    """Write one file per episode, with names that sort in order."""
     folder.mkdir()
     states = False
     for number, rows in enumerate(source.read(0)):
