@@ -83,8 +83,10 @@ def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple
         The agents' cards, and their episodes.
 
     Raises:
-        UserError: an agent is unknown or damaged, or the agents' tasks differ.
+        UserError: no agent is named, one is unknown or damaged, or their tasks differ.
     """
+    if not names:
+        raise UserError("no agents are named: name at least one that ships, or a folder")
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
     found = [find_agent(name) for name in names]
