@@ -95,7 +95,7 @@ class PretrainConfig(TrainingConfig):
     shift: int = 4
     """Largest random shift in pixels; the method decides whether a window or each observation is shifted as one."""
     history: str = "method"
-    """Memory of the encoder, such as gru, or none; method uses the method's default."""
+    """Memory of the encoder, such as gru; method uses the method's default."""
     corruption: CorruptionConfig = NO_CORRUPTION
     """Corruption that makes the observations partial."""
 
