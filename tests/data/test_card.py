@@ -12,7 +12,6 @@ from vd4rl_pomdp.core.text import markdown
 from vd4rl_pomdp.data import card as module
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import published_scores
-from vd4rl_pomdp.data.parity import golden_tasks
 
 MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
 
@@ -65,7 +64,7 @@ def test_one_shard_of_a_set_gets_no_card(tmp_path):
 
 def test_every_set_of_the_benchmark_has_a_published_score():
     assert {(row["env"], row["dataset"]) for row in published_scores()} == {
-        (t, q) for t in golden_tasks() for q in QUALITIES
+        (t, q) for t in ("walker_walk", "cheetah_run", "humanoid_walk") for q in QUALITIES
     }
     assert set(module.HOW) == set(SET_QUALITIES)
 

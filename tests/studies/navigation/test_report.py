@@ -167,7 +167,7 @@ def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_pa
     (tmp_path / "mine" / "README.md").write_text("mine")
     run = runs / "three_curtains" / "mik-K15" / "seed0"
     for out in (tmp_path / "mine", runs, run, run / "report"):
-        with pytest.raises(UserError, match="choose another --out"):
+        with pytest.raises(UserError, match="choose another"):
             write_report([runs], out)
     assert (tmp_path / "mine" / "README.md").read_text() == "mine"
 
