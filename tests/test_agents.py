@@ -46,7 +46,7 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
             now = env.step(agent.act(now.obs.numpy()))
             rewards.append(now.time_step.reward)
         assert (round(float(np.cumsum(rewards)[-1]), 4), len(rewards)) == (row["return"], row["length"])
-    film = tmp_path / "film.webp"
+    film = tmp_path / "new" / "film.webp"
     main(["agents", "play", str(out), str(out), "--episodes", "2", "--film", str(film), "--workers", "1"])
     head, first, second, less, written = capsys.readouterr().out.splitlines()
     assert head.startswith(f"2 episodes of {card['task']} under patch+zero_frames")

@@ -9,7 +9,7 @@ import tyro
 
 from vd4rl_pomdp import hub
 from vd4rl_pomdp.cli.parsing import command
-from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
 
@@ -98,5 +98,7 @@ def play(
         interval = mean_interval(values)
         print(f"  {name:<36}{values.mean():6.0f}" + (f" [{interval[0]:.0f}, {interval[1]:.0f}]" if interval else ""))
     if film:
+        with disk_errors(film.parent):
+            film.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(film, side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
         print(f"film: {film}")
