@@ -80,7 +80,7 @@ def play(
     """
     from finetune.export import play_agents
     from vd4rl_pomdp.report.films import side_by_side
-    from vd4rl_pomdp.report.stats import mean_interval
+    from vd4rl_pomdp.report.stats import mean_interval, with_interval
 
     if film:
         refuse_inside(film)
@@ -95,8 +95,8 @@ def play(
     lines = list(zip(names, returns, strict=True))
     lines += [(f"{names[0]} less {name}", returns[0] - others) for name, others in lines[1:]]
     for name, values in lines:
-        interval = mean_interval(values)
-        print(f"  {name:<36}{values.mean():6.0f}" + (f" [{interval[0]:.0f}, {interval[1]:.0f}]" if interval else ""))
+        low, high = mean_interval(values) or (None, None)
+        print(f"  {name:<38} {with_interval(values.mean(), low, high, 0)}")
     if film:
         with disk_errors(film.parent):
             film.parent.mkdir(parents=True, exist_ok=True)

@@ -75,10 +75,7 @@ def movie(film: Film) -> bytes:
     newest = film["corrupted"][:, -3:]
     pairs = np.concatenate([film["clean"], newest], axis=3).transpose(0, 2, 3, 1)
     size = (pairs.shape[2] * 2, pairs.shape[1] * 2)
-    frames = [Image.fromarray(pair).resize(size, Image.Resampling.NEAREST) for pair in pairs]
-    buffer = io.BytesIO()
-    frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=60)
-    return buffer.getvalue()
+    return _webp([Image.fromarray(pair).resize(size, Image.Resampling.NEAREST) for pair in pairs], 60)
 
 
 def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
@@ -94,9 +91,13 @@ def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
         )
         for shot in range(max(len(film["clean"]) for film in films))
     ]
+    return _webp([Image.fromarray(frame) for frame in frames], 70)
+
+
+def _webp(frames: Sequence[Image.Image], quality: int) -> bytes:
+    """Animated WebP at 12.5 frames a second that repeats forever."""
     buffer = io.BytesIO()
-    first, *rest = map(Image.fromarray, frames)
-    first.save(buffer, "WEBP", save_all=True, append_images=rest, duration=80, loop=0, quality=70)
+    frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=quality)
     return buffer.getvalue()
 
 
