@@ -201,7 +201,7 @@ class FeatureSampler:
         index = self.draws.integers(count, self.batch_size)
         view = self.draws.integers(len(self.features), self.batch_size)
         ends = self.ends.flatten(1)[:, torch.add(index, view, alpha=count)]
-        return _batch(self.features.flatten(0, 1)[ends], self.told[index])
+        return _batch(_rows(self.features.flatten(0, 1), ends), _rows(self.told, index))
 
 
 class StackedSampler:
@@ -225,10 +225,16 @@ class StackedSampler:
         view = self.draws.integers(self._views, *self._shape)
         ends = self._ends[:, torch.add(index, view, alpha=len(self._told))]
         if self._shared:
-            both = self._features[0][ends]
+            both = _rows(self._features[0], ends)
         else:
-            both = torch.stack([own[end] for own, end in zip(self._features, ends.unbind(1), strict=True)], dim=1)
-        return _batch(both, self._told[index])
+            pairs = zip(self._features, ends.unbind(1), strict=True)
+            both = torch.stack([_rows(own, end) for own, end in pairs], dim=1)
+        return _batch(both, _rows(self._told, index))
+
+
+def _rows(values: Tensor, numbers: Tensor) -> Tensor:
+    """`values[numbers]` of (N, D), contiguous; on a CPU several times as fast as indexing."""
+    return values.index_select(0, numbers.flatten()).view(*numbers.shape, -1)
 
 
 def _batch(both: Tensor, told: Tensor) -> FeatureBatch:
