@@ -69,16 +69,12 @@ def _of_seeds(words: list[str]) -> list[list[str]]:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Evaluate a fine-tuned run again, as trained and without corruption, or under a given corruption only. For the
-    options
-        of a corruption, name it before --help.
-    """
+    """Evaluate a fine-tuned run again, as trained and uncorrupted, or under one --corruption (named before --help)."""
 
     run: tyro.conf.Positional[Path]
     """Folder of a fine-tuning run."""
     corruption: str | None = None
-    """Corruption at evaluation; options not given default to the run's own. Default: the training corruption, then
-    none."""
+    """Corruption at evaluation; its options default to the run's own. Default: the training corruption, then none."""
     stages: tuple[Options, ...] = ()
     """Options of the corruption."""
     episodes: int = 10
