@@ -217,11 +217,13 @@ def another(trained: dict[str, Any], corruption: str, options: dict[str, Any]) -
 def refuse_kept(run: Path, evaluated_under: str) -> None:
     """Raise UserError if rows cannot be added to a run: it is unfinished, or has rows under that corruption already."""
     if not (run / TIMING_FILE).exists():
-        raise UserError(f"{run}: has not finished, and writes {EPISODES_FILE} itself; leave --keep out until then")
+        raise UserError(f"{run}: is not finished and still writes {EPISODES_FILE}; leave --keep out until then")
     step = policy_step(run / "policy")
     rows = [row for row in read_episodes(run / EPISODES_FILE) if row["step"] == step]
     if there := sum(row["evaluated_under"] == evaluated_under for row in rows):
-        raise UserError(f"{run}: {EPISODES_FILE} has {there} episodes under {evaluated_under}; leave --keep out")
+        raise UserError(
+            f"{run}: {EPISODES_FILE} already has {there} episodes under {evaluated_under}; leave --keep out"
+        )
 
 
 def evaluate_run(
@@ -285,11 +287,13 @@ def replay(run: Path, results: Iterable[Result]) -> tuple[Row, Row, str]:
     own, step = read_run(run), policy_step(run / "policy")
     told = next((result for result in results if result.id == own.id), None)
     if told is None:
-        raise UserError(f"{run}: is the run {own.id}, which has no row there; name the folder of one that has")
+        raise UserError(f"{run}: run {own.id} has no rows in the results folder; name a run that has")
     of_policy = [row for row in told.rows if row["step"] == step and row["evaluated_under"] == row["corruption"]]
     recorded = next((row for row in of_policy if row["episode"] == 0), None)
     if recorded is None:
-        raise UserError(f"{run}: its policy is of update {step}, of which run {own.id} has no first episode there")
+        raise UserError(
+            f"{run}: its policy is from update {step}, for which the results lack run {own.id}'s first episode"
+        )
     (replayed,), _ = evaluate_run(run, recorded["corruption"], 1, 1)
     made = told.files.get("render", {}), told.parts[-1].get("processor")
     row, here = (

@@ -40,7 +40,7 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
         raise UserError(f"{out}: is not empty; choose another --out")
     told = read_run(run)
     if told.record["stage"] != "finetune" or not told.finished or told.diverged:
-        raise UserError(f"{run}: is no finished fine-tuning; name a folder that `vd4rl-pomdp finetune` wrote")
+        raise UserError(f"{run}: is not a finished fine-tuning run; name a folder that `vd4rl-pomdp finetune` wrote")
     encoder, config = read_record(run / "encoder"), told.record["config"]
     about = encoder.pretrain
     write_rounded(run, out)
@@ -86,15 +86,13 @@ def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple
         UserError: no agent is named, one is unknown or damaged, or their tasks differ.
     """
     if not names:
-        raise UserError("no agents are named: name at least one that ships, or a folder")
+        raise UserError("no agents given: name a shipped agent or a folder")
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
     found = [find_agent(name) for name in names]
     cards = [card for _, card in found]
     if len({card["task"] for card in cards}) > 1:
-        raise UserError(
-            f"agents of one task can be compared, and not of {' and '.join(card['task'] for card in cards)}"
-        )
+        raise UserError(f"agents must have the same task, not {' and '.join(card['task'] for card in cards)}")
     task, under = TASKS.named(cards[0]["task"]), [CorruptionConfig.fill(cards[0]["corruption"])]
     jobs = [job for folder, card in found for job in jobs_of(folder, task, under, episodes, card["length"], film=True)]
     played = evaluate(jobs, workers)

@@ -51,7 +51,7 @@ class HistoryOptions(Options):
         if self.shortest_history > self.longest_history:
             raise UserError(
                 f"--shortest-history is {self.shortest_history}, --longest-history {self.longest_history}: "
-                "choose a longest that is no shorter"
+                "choose a longest that is not shorter"
             )
 
     @property

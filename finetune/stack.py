@@ -83,7 +83,7 @@ class Stack:
             if "vmap" not in str(error):
                 raise
             raise UserError(
-                f"runs of {type(self.whole).__name__} do not stack ({first_line(error)}): train each by itself"
+                f"runs of {type(self.whole).__name__} cannot be stacked ({first_line(error)}): train each by itself"
             ) from error
         return found
 

@@ -109,16 +109,20 @@ def _refuse_unlike(asked: Sequence[_Asked]) -> None:
     first = asked[0]
     for number, one in enumerate(asked):
         if one.card.end_to_end:
-            raise UserError(f"{one.config.out}: {one.card.method} trains its encoder, too, and does not stack")
+            raise UserError(
+                f"{one.config.out}: {one.card.method} also trains its encoder and cannot be stacked; train it by itself"
+            )
         if not one.config.views:
-            raise UserError(f"{one.config.out}: --views 0 encodes every batch anew and does not stack")
+            raise UserError(
+                f"{one.config.out}: --views 0 encodes every batch and cannot be stacked; train it by itself"
+            )
         if any(one.config.out.resolve() == other.config.out.resolve() for other in asked[:number]):
             raise UserError(f"--out {one.config.out} is given twice: a folder holds one run")
         for (what, value), (_, other) in zip(_alike(first), _alike(one), strict=False):
             if value != other:
                 raise UserError(
-                    f"{first.config.out} and {one.config.out} do not stack: {what} is {value} there and {other} here; "
-                    "train them by commands of their own"
+                    f"{first.config.out} and {one.config.out} cannot be stacked: {what} is {value} and {other}; "
+                    "train them by separate commands"
                 )
 
 

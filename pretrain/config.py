@@ -149,7 +149,7 @@ def history_of(name: str, method: Method, history: str) -> str:
     if method.end_to_end or method.reads_state:
         raise UserError(f"{name} has no memory: --history {history} is for pretrained methods")
     if method.histories:
-        raise UserError(f"{name} has the memory that its name tells: leave --history {history} out")
+        raise UserError(f"{name} implies its memory: leave --history {history} out")
     if history not in MEMORIES.broken:
         refuse_unknown("--history", history, ("method", *MEMORIES), OR_ONES_OWN)
     return history

@@ -144,9 +144,9 @@ def view_of(dataset: Dataset, config: PretrainConfig) -> View:
 def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
     name = config.task or dataset.task
     if name is None:
-        raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
+        raise UserError(f"{config.data}: cannot determine the dataset's task; pass --task")
     if dataset.task is not None and name != dataset.task:
-        raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
+        raise UserError(f"{config.data}: is a dataset of {dataset.task}, not of {name}; leave --task out")
     if dataset.imported and name not in TASKS:
         return name  # pretraining needs no environment; evaluation refuses an unknown task
     if (width := layout_of(TASKS.named(name)).action_dim) != dataset.action_dim:

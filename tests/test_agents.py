@@ -71,7 +71,7 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
     for name in FILES:
         whole = (out / name).read_bytes()
         (out / name).write_bytes(whole + b" ")
-        with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
+        with pytest.raises(UserError, match=r"its files do not match card\.json"):
             load_agent(out)
         (out / name).write_bytes(whole)
     for damaged in (
@@ -79,7 +79,7 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
         *(card | {name: None} for name in ("task", "method", "corruption", "sha256")),
     ):
         write_json(out / "card.json", damaged)
-        with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
+        with pytest.raises(UserError, match=r"its files do not match card\.json"):
             load_agent(out)
 
 
@@ -87,7 +87,11 @@ def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     (whole_run(tmp_path / "cut") / "timing.json").unlink()
     pretraining(tmp_path / "pretrained")
-    for name, told in (("cut", "is no finished fine-tuning"), ("pretrained", "is no finished"), ("empty", "is no run")):
+    for name, told in (
+        ("cut", "is not a finished fine-tuning run"),
+        ("pretrained", "is not a finished"),
+        ("empty", "is not a run"),
+    ):
         with pytest.raises(SystemExit) as ended:
             main(["agents", "export", str(tmp_path / name), "--out", str(tmp_path / "new")])
         assert ended.value.code == 2
@@ -98,7 +102,7 @@ def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
 def test_an_unknown_name_lists_what_ships(tmp_path):
     with pytest.raises(UserError) as told:
         load_agent("walker_walk/medium_expert/patch/mine")
-    assert f"the package ships {', '.join(shipped()) or 'none'}" in str(told.value)
+    assert f"or a shipped agent ({', '.join(shipped()) or 'none'})" in str(told.value)
     assert "\n" not in str(told.value)
 
 

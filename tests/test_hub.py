@@ -95,7 +95,7 @@ def test_a_set_comes_back_as_it_was_and_a_later_push_replaces_all_of_an_earlier_
     assert pull(SET, tmp_path / "new")
     assert content(tmp_path / "new") == content(data)
     (tmp_path / "new" / "9_more.H5").write_bytes(b"mine")
-    with pytest.raises(UserError, match="is not empty and holds something else"):
+    with pytest.raises(UserError, match="is not empty and holds something other"):
         pull(SET, tmp_path / "new")
 
 
@@ -133,7 +133,7 @@ def test_an_agent_comes_back_as_it_was_and_does_not_pass_for_an_encoder(hub, enc
     readme = hub.files(WHERE[ENCODER])["README.md"].decode()
     assert yaml.safe_load(readme.split("---\n")[1])["license"] == "mit"
     (tmp_path / "agent" / "policy" / "config.json").write_text("{}")
-    with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
+    with pytest.raises(UserError, match=r"its files do not match card\.json"):
         push(tmp_path / "agent", ENCODER)
 
 
@@ -155,7 +155,7 @@ def test_revisions_are_branches_and_commits(hub, encoder, tmp_path):
 
 def test_only_whole_encoders_and_sets_go_to_repositories_of_their_kind(hub, encoder, data, tmp_path):
     for text in ("encoder", "datasets/set", "models/lab/encoder", ""):
-        with pytest.raises(UserError, match="names no repository: write OWNER/NAME for an encoder, datasets/OWNER"):
+        with pytest.raises(UserError, match="is not a repository: write OWNER/NAME for an encoder, datasets/OWNER"):
             push(encoder, text)
     for folder, where in ((tmp_path / "run", ENCODER), (encoder, SET), (data, ENCODER)):
         with pytest.raises(UserError, match=f"holds .*, not .*, which {where} is the name for"):
@@ -244,7 +244,7 @@ def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, what):
         assert content(target) == content(encoder)
         return
     before = content(tmp_path)
-    with pytest.raises(UserError, match="is not empty and holds something else than lab/encoder; choose another"):
+    with pytest.raises(UserError, match="is not empty and holds something other than lab/encoder; choose another"):
         pull(ENCODER, target)
     assert content(tmp_path) == before
     assert lists(tmp_path) == ["run", "there"]

@@ -312,7 +312,7 @@ def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, finetun
     (config.out / "timing.json").unlink()
     shutil.rmtree(config.out / "checkpoints")
     before = (config.out / "episodes.csv").read_bytes()
-    with pytest.raises(UserError, match=r"run: has evaluations, but the checkpoints .* are gone: put them back"):
+    with pytest.raises(UserError, match=r"run: has evaluations, but the checkpoints .* are gone: restore them"):
         run_finetune(config)
     assert (config.out / "episodes.csv").read_bytes() == before
 

@@ -163,7 +163,7 @@ def test_an_option_with_the_name_of_another_setting_is_refused_wherever_both_are
 ):
     options = option_called(option, FrameOptions if kind == "frame_encoder" else Options)
     registries[kind].register("mine", part_with(kind, options))
-    told = rf"({owner} and Mine|Mine and {owner}) both have the setting '{option}', and --.* cannot set two: rename"
+    told = rf"({owner} and Mine|Mine and {owner}) both have the setting '{option}', so --.* would be ambiguous: rename"
     stage, config = ("finetune", FinetuneConfig) if kind == "algorithm" else ("pretrain", PretrainConfig)
     chosen = {kind: "mine"} | ({"corruption": "patch"} if option == "patch_size" else {})
     with pytest.raises(UserError, match=told):

@@ -135,13 +135,13 @@ def test_actions_are_rescaled_and_pictures_shrunk(tasks):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"quality": "expert"}, "centre has no states for an actor to read: --quality random"),
+        ({"quality": "expert"}, "centre has no states for an actor to read: use --quality random"),
         ({"quality": "medium_replay"}, "centre has no states"),
         (
             {"task": "cartpole_swingup", "quality": "expert"},
             "no expert actor ships for cartpole_swingup .*train_actor",
         ),
-        ({"task": "cartpole_swingup", "quality": "expert_noisy"}, "names no noise of its own: .*--action-noise"),
+        ({"task": "cartpole_swingup", "quality": "expert_noisy"}, "has no action_noise: .*--action-noise"),
         ({"frame_size": 15}, "--frame-size is 15; it must be at least 16 and at most 480"),
     ],
 )
@@ -174,7 +174,7 @@ def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before
     for changes, message in (
         ({"corruption": "patch", "patch_size": 17}, r"patch size 17 exceeds the image \(16x16\)"),
         ({"shift": 16}, "--shift is 16; it must be at least 0 and at most 15"),
-        ({"frame_encoder": "nature"}, "frame encoder 'nature' cannot read pictures of 16x16 pixels"),
+        ({"frame_encoder": "nature"}, "frame encoder 'nature' cannot read images of 16x16 pixels"),
     ):
         with pytest.raises(UserError, match=message):
             run_pretrain(base.altered(**changes))
@@ -237,7 +237,7 @@ def test_a_set_that_is_not_whole_is_not_continued_by_a_task_whose_file_changed(t
     assert collect_by(CODE + "# changed\n") == [first, second], "a set that is whole stays one"
     for path in (second, tmp_path / "set" / "provenance.json"):
         path.unlink()
-    with pytest.raises(UserError, match=r"set: was begun before the code of task centre changed, and is not whole"):
+    with pytest.raises(UserError, match=r"set: is unfinished, and the code of task centre has changed since"):
         collect_by(CODE + "# changed\n")
     assert collect_by(CODE) == [first, second]
 
@@ -246,6 +246,6 @@ def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):
     config = CollectConfig("centre", "random", tmp_path / "set", episodes=2, workers=1)
     collect(config, 8)
     assert json.loads((tmp_path / "set" / "collection.json").read_text())["frame_size"] is None
-    with pytest.raises(UserError, match="another frame_size"):
+    with pytest.raises(UserError, match="differs in frame_size"):
         collect(replace(config, frame_size=64), 8)
     collect(config, 8)

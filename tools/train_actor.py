@@ -350,7 +350,7 @@ def _begin(config: PolicyConfig) -> None:
     if path.exists():
         stored = json.loads(path.read_text(encoding="utf-8"))
         if differing := [name for name, value in kept.items() if stored.get(name) != value]:
-            raise UserError(f"{config.out}: holds a run with another {', '.join(differing)}; choose another --out")
+            raise UserError(f"{config.out}: holds a run that differs in {', '.join(differing)}; choose another --out")
         return
     if config.out.exists() and any(config.out.iterdir()):
         raise UserError(f"{config.out}: is not empty and holds no training run; choose another --out")

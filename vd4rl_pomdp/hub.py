@@ -124,7 +124,9 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             others = {shard.name for shard in shard_files(folder)} - listing.keys()  # extra shards: another data set
             if folder.is_dir() and not others and not _wrong(folder, listing):
                 return False
-            raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
+            raise UserError(
+                f"{folder}: is not empty and holds something other than {repository}; choose another folder"
+            )
         # Next to the folder, so that the final rename is atomic; its fixed name lets the next pull resume.
         api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
     with disk_errors(folder):
@@ -149,7 +151,7 @@ def _repository(text: str) -> tuple[str, str]:
     name = text.removeprefix("datasets/")
     if name.count("/") != 1 or not all(name.split("/")):
         raise UserError(
-            f"{text!r} names no repository: write OWNER/NAME for an encoder, datasets/OWNER/NAME for a data set"
+            f"{text!r} is not a repository: write OWNER/NAME for an encoder, datasets/OWNER/NAME for a dataset"
         )
     return name, ENCODER if name == text else SET
 

@@ -73,7 +73,7 @@ class MaskedInverse(InverseObjective):
         self.newest = options.future_frames == "newest"
         if self.newest and encoder.frame_stack == 1:
             raise UserError(
-                "--future-frames newest blanks older frames of a stack, and here an observation is one frame: "
+                "--future-frames newest blanks older frames of a stack, but observations here have one frame: "
                 "leave it out"
             )
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)

@@ -52,7 +52,9 @@ class Supervised(Objective):
         self.encoder = encoder
         columns = torch.nonzero(target.std)[:, 0]  # constant coordinates cannot be standardised
         if not len(columns):
-            raise UserError("the simulator's states in this set are all the same: there is nothing to regress")
+            raise UserError(
+                "all simulator states in this dataset are equal, so there is nothing to regress: choose another dataset"
+            )
         self.register_buffer("columns", columns)
         self.register_buffer("mean", target.mean[columns].float())
         self.register_buffer("std", target.std[columns].float())

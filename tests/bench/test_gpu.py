@@ -54,7 +54,7 @@ def test_without_a_gpu_only_a_trial_is_run():
 
 
 def test_a_process_that_ends_without_an_answer_is_told():
-    with pytest.raises(WorkerDiedError, match="without an answer"):
+    with pytest.raises(WorkerDiedError, match="without a result"):
         processes.apart("vd4rl_pomdp.bench.processes.nothing")
 
 

@@ -65,7 +65,7 @@ def test_a_drop_of_ones_own_keeps_them_and_ends_a_name(stages):
     stages.register("mine", Alternating)
     for name in ("mine", "patch+mine"):
         check_corruption(name)
-    with pytest.raises(UserError, match="zero_frames or truncate or mine may only end it"):
+    with pytest.raises(UserError, match="zero_frames or truncate or mine only at the end"):
         check_corruption("mine+patch")
 
 
@@ -133,11 +133,11 @@ class Failing(Options):
 
 MUTANTS = [
     (Nothing, something_changes, "none differs"),
-    (Batchwise, equal_keys_give_equal_masks, "stacks look otherwise in a batch than alone"),
-    (Mixing, equal_keys_give_equal_masks, "stacks look otherwise in a batch than alone"),
-    (Batchwise, the_environment_shows_what_the_data_show, "a row looks otherwise in the environment"),
+    (Batchwise, equal_keys_give_equal_masks, "a stack looks different in a batch than alone"),
+    (Mixing, equal_keys_give_equal_masks, "a stack looks different in a batch than alone"),
+    (Batchwise, the_environment_shows_what_the_data_show, "a row looks different in the environment"),
     (Drawing, draws_depend_on_keys_alone, "equal keys gave different pixels"),
-    (Counting, emission_never_changes_a_row, "a row looked otherwise when it came again"),
+    (Counting, emission_never_changes_a_row, "a row looked different the second time"),
     (Counting, a_view_shows_shifted_then_corrupted_stacks, "they differ under resample with a shift of 0"),
     (Elsewhere, a_view_shows_shifted_then_corrupted_stacks, "a GPU would hide other pixels"),
     (Failing, pixels_stay_pixels, "IndexError: no such column"),

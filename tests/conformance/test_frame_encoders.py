@@ -103,9 +103,9 @@ MUTANTS = [
     (
         lambda: nn.BatchNorm2d(4),
         pictures_are_not_mixed,
-        r"features of picture 1 have gradients to \[True, True, True\]",
+        r"features of image 1 have gradients to \[True, True, True\]",
     ),
-    (Centred, pictures_are_not_mixed, "features of picture 1 have gradients to"),
+    (Centred, pictures_are_not_mixed, "features of image 1 have gradients to"),
     (Lost, gradients_reach_all_parameters, "none reaches convolutions.1.unused.bias, convolutions.1.unused.weight"),
     (Counting, a_seed_decides_everything, "features differ from call to call"),
     (nn.Dropout, a_seed_decides_everything, "features differ from call to call, training True"),
@@ -137,7 +137,7 @@ def test_a_right_one_passes_at_any_size_and_what_cannot_be_is_refused(encoders):
     check_frame_encoder("mine", size=SIZE, feature_dim=5)
     with pytest.raises(UserError, match="--depth is not read by"):
         check_frame_encoder("mine", depth=3)
-    with pytest.raises(UserError, match="'mixer' cuts pictures into patches"):
+    with pytest.raises(UserError, match="'mixer' cuts images into patches"):
         check_frame_encoder("mixer", size=84)
     with pytest.raises(UserError, match="unknown frame encoder 'vit'"):
         check_frame_encoder("vit")
@@ -174,16 +174,14 @@ def test_shared_weights_and_convolutions_of_other_dimensions_are_kept(encoders, 
 def test_a_part_that_cannot_be_built_for_a_size_is_told_with_its_reason(encoders):
     encoders.register("large", FrameEncoderPart(with_layer(lambda: nn.MaxPool2d(7))))
     with pytest.raises(
-        UserError, match=r"'large' cannot read pictures of 20x20 pixels \(.*too small.*\): choose another"
+        UserError, match=r"'large' cannot read images of 20x20 pixels \(.*too small.*\): choose another"
     ):
         make("large", size=SIZE)
 
 
 def test_a_module_that_makes_no_maps_is_refused_where_it_is_built(encoders):
     encoders.register("mine", FrameEncoderPart(with_layer(Flat)))
-    told = (
-        r"frame encoder 'mine' makes \('N', 144\) of N pictures, not maps \(N, C', H', W'\): give its module's output"
-    )
+    told = r"frame encoder 'mine' makes \('N', 144\) of N images, not maps \(N, C', H', W'\): give its module's output"
     for build in (check_frame_encoder, make):
         with pytest.raises(UserError, match=told):
             build("mine", size=SIZE)
@@ -208,5 +206,5 @@ def test_what_builds_no_module_of_maps_is_refused(encoders, build, told):
 
 
 def test_the_name_of_what_reads_states_is_refused(encoders):
-    with pytest.raises(UserError, match="frame encoder 'state': encoders of simulator states have this name"):
+    with pytest.raises(UserError, match="frame encoder 'state': this name is reserved"):
         encoders.register("state", FrameEncoderPart(convolution))

@@ -148,7 +148,7 @@ def test_a_memory_that_breaks_a_promise_is_told_which_and_how(memories, kind, ch
 
 @pytest.mark.parametrize("name", ["none", "method"])
 def test_words_that_history_has_for_something_else_are_refused(memories, name):
-    with pytest.raises(UserError, match=f"memory '{name}': --history has this word"):
+    with pytest.raises(UserError, match=f"memory '{name}': this name is reserved"):
         memories.register(name, MemoryPart(GRU, GRUOptions))
 
 
@@ -157,5 +157,5 @@ def test_what_is_no_memory_is_refused_where_it_is_built(memories):
     with pytest.raises(UserError, match=r"memory .mine. builds a Identity, not a vd4rl"):
         check_memory("mine")
     memories.register("frame", MemoryPart(GRU, GRUOptions))
-    with pytest.raises(UserError, match="memory 'frame': an encoder has something of this name"):
+    with pytest.raises(UserError, match="memory 'frame': an encoder has an attribute of this name"):
         check_memory("frame")

@@ -93,7 +93,7 @@ def tasks():
 
 WALKER = TASKS["walker_walk"]
 MUTANTS = [
-    (GymnasiumTask(Unseeded), episodes_repeat_from_their_seeds, "row 0 shows another picture or state"),
+    (GymnasiumTask(Unseeded), episodes_repeat_from_their_seeds, "row 0 differs in frame or state"),
     (GymnasiumTask(Square, layout=Layout(3)), rows_have_the_declared_widths, "its layout says .* the environment has"),
     (replace(WALKER, layout=Layout(6, 23, 9, travel=(1,))), rows_have_the_declared_widths, "its layout says"),
     (GymnasiumTask(Failing), episodes_end_once, "RuntimeError: the motor is off"),
@@ -145,8 +145,8 @@ def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
             rows_have_the_declared_widths,
             "a reward is inf",
         ),
-        (PixelEnv, "step", lambda self, a: replace(step(self, a), step_type=1), episodes_end_once, "decisions goes on"),
-        (dmc, "replay_rewards", lambda n, p, a: np.zeros(len(a)), rewards_replay, "were paid"),
+        (PixelEnv, "step", lambda self, a: replace(step(self, a), step_type=1), episodes_end_once, "does not end"),
+        (dmc, "replay_rewards", lambda n, p, a: np.zeros(len(a)), rewards_replay, "and replay as"),
     ]
     for place, name, instead, check, reason in broken:
         with monkeypatch.context() as patch:
@@ -163,7 +163,7 @@ def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
     with pytest.raises(UserError, match="unknown task 'mine'"):
         check_task("mine")
     tasks.register("infinite", GymnasiumTask(Infinite))
-    with pytest.raises(UserError, match="environment Infinite pays inf"):
+    with pytest.raises(UserError, match="environment Infinite returns the reward inf"):
         check_task("infinite")
 
 

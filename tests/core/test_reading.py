@@ -20,9 +20,9 @@ NESTED = "[" * 100_000 + "]" * 100_000
 def test_pipes_folders_and_devices_are_no_files(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, type(tmp_path)("/dev/zero")):
-        with pytest.raises(UserError, match="is no regular file"):
+        with pytest.raises(UserError, match="not a regular file"):
             regular(path)
-        with pytest.raises(UserError, match="is no regular file"):
+        with pytest.raises(UserError, match="not a regular file"):
             read_json(path)
     assert regular(tmp_path / "missing") == tmp_path / "missing"
 

@@ -155,7 +155,7 @@ def test_what_is_no_task_is_not_registered():
 
 @pytest.mark.parametrize("name", ["my/cartpole", "/cartpole", "cartpole/", "", ".", ".."])
 def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
-    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': folders and `--only` are made of names"):
+    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': folders and `--only` contain names"):
         TASKS.register(name, DMCTask("cartpole", "swingup"))
 
 
@@ -215,7 +215,7 @@ def test_a_reward_that_is_no_number_is_refused_in_the_step_that_pays_it(paid):
     env.reset(0)
     assert env.step(np.zeros(2, np.float32)).reward == 1
     with pytest.raises(
-        UserError, match=rf"environment Unpaid pays {re.escape(str(paid))}, expected a number: mend its rewards"
+        UserError, match=rf"environment Unpaid returns the reward {re.escape(str(paid))}, expected a number"
     ):
         env.step(np.zeros(2, np.float32))
 
@@ -223,8 +223,8 @@ def test_a_reward_that_is_no_number_is_refused_in_the_step_that_pays_it(paid):
 @pytest.mark.parametrize(
     ("method", "given", "told"),
     [
-        ("step", (np.zeros(1), 0.0, False, {}), "gives 4 values in step, where Gymnasium's interface has 5: wrap it"),
-        ("reset", np.zeros(1), "gives a ndarray in reset, where Gymnasium's interface has 2: wrap it"),
+        ("step", (np.zeros(1), 0.0, False, {}), "returns 4 values from step, expected 5 as in Gymnasium: wrap it"),
+        ("reset", np.zeros(1), "returns a ndarray from reset, expected 2 as in Gymnasium: wrap it"),
     ],
 )
 def test_an_environment_of_another_interface_is_one_line(monkeypatch, method, given, told):

@@ -156,7 +156,7 @@ def test_unknown_and_impossible_corruptions_are_refused():
         make_corruption("fog")
     for name in ("zero_frames+patch", "patch+patch", "zero_frames+zero_frames"):
         with pytest.raises(
-            UserError, match=r"unknown corruption .*: a name joins stages by \+, each once, and zero_frames"
+            UserError, match=r"unknown corruption .*: join stages with \+, each at most once, with zero_frames"
         ):
             CorruptionConfig.of(name)
     with pytest.raises(UserError, match="--patch-size"):
@@ -253,7 +253,7 @@ def test_truncation_ends_a_name_and_knows_two_frames():
     with pytest.raises(UserError, match="--kept 'middle': choose one of newest, oldest"):
         make_corruption(CorruptionConfig.of("truncate", kept="middle"))
     for name in ("truncate+patch", "zero_frames+truncate", "truncate+zero_frames"):
-        with pytest.raises(UserError, match="zero_frames or truncate may only end it"):
+        with pytest.raises(UserError, match="zero_frames or truncate only at the end"):
             CorruptionConfig.of(name)
 
 

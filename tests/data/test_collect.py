@@ -81,7 +81,7 @@ def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
     shard.unlink()
     with monkeypatch.context() as patch:
         patch.setattr(parity, "render_info", lambda task: info | {"canary": "other", "gl_renderer": "another GPU"})
-        with pytest.raises(UserError, match=r"its shards so far were drawn by .*, and another GPU draws other pixels"):
+        with pytest.raises(UserError, match=r"its shards were rendered by .*, and another GPU renders other pixels"):
             collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
     assert not shard.exists()
     collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
@@ -103,7 +103,7 @@ def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monke
             collect(config(out), LENGTH)
     seen = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
     assert seen == ["0_walker_walk_random.hdf5", "collection.json"]
-    with pytest.raises(UserError, match="set: the set's collection is not finished"):
+    with pytest.raises(UserError, match="set: the dataset's collection is not finished"):
         shard_paths(out)
     (out / ".1_walker_walk_random.hdf5.tmp").write_bytes(b"half")
     first = (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns
@@ -182,7 +182,7 @@ def test_a_folder_of_another_config_is_refused_untouched(whole, change):
 
 def test_a_folder_with_something_else_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(UserError, match="holds no collected set"):
+    with pytest.raises(UserError, match="holds no collected dataset"):
         collect(config(tmp_path), LENGTH)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 

@@ -155,7 +155,7 @@ def test_an_episode_of_one_row_is_left_out_of_windows_of_any_length(tmp_path):
     with pytest.raises(UserError, match=r"episode 1 has 5 rows, .* \(2 such episodes\); choose a window of at most 4"):
         dataset.num_windows(6)
     empty = open_dataset(write_fake_set(tmp_path / "empty", (1, 1)), tmp_path / "cache")
-    with pytest.raises(UserError, match="holds no transition; every episode in it is a single row"):
+    with pytest.raises(UserError, match="holds no transitions, since every episode has a single row"):
         empty.num_windows(2)
 
 
@@ -267,5 +267,5 @@ def test_a_link_tells_a_set_as_the_folder_that_it_names_would(tmp_path):
     (tmp_path / "walker_walk" / "expert").symlink_to(held)
     linked = open_dataset(tmp_path / "walker_walk" / "expert", tmp_path / "cache")
     assert (linked.task, linked.quality) == ("walker_walk", "expert")
-    with pytest.raises(UserError, match=r"medium: has physics but names no task; put it in a folder called"):
+    with pytest.raises(UserError, match=r"medium: has physics but names no task; put it in a folder named"):
         open_dataset(held, tmp_path / "cache").require_states()

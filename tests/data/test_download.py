@@ -151,8 +151,8 @@ def test_a_users_token_goes_to_their_own_hub_alone(mirror, tmp_path, monkeypatch
     [
         (("walker_run", "expert"), "unknown task of published sets 'walker_run': choose one of cheetah_run"),
         (("walker_walk", "best"), "unknown quality 'best': choose one of random"),
-        (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is no address"),
-        (("walker_walk", "expert", "http://["), r"endpoint 'http://\[' is no address"),
+        (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is not an address"),
+        (("walker_walk", "expert", "http://["), r"endpoint 'http://\[' is not an address"),
     ],
 )
 def test_what_is_not_published_is_refused(tmp_path, arguments, message):

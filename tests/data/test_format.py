@@ -45,9 +45,9 @@ def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["0_a", "1_a", "3_a"], "has the shard 3_a, but none called 2_a"),
-        (["0_a", "1_a", "1_b", "2_b"], "has the shard 2_b, but none called 0_b"),
-        (["0", "2"], "has the shard 2, but none called 1"),
+        (["0_a", "1_a", "3_a"], "has the shard 3_a, but not 2_a"),
+        (["0_a", "1_a", "1_b", "2_b"], "has the shard 2_b, but not 0_b"),
+        (["0", "2"], "has the shard 2, but not 1"),
     ],
 )
 def test_a_number_that_is_left_out_is_told(tmp_path, names, message):
@@ -61,7 +61,7 @@ def test_a_number_that_is_left_out_is_told(tmp_path, names, message):
 def test_a_shard_that_is_there_twice_is_told(tmp_path, names):
     for name in names:
         (tmp_path / name).touch()
-    with pytest.raises(UserError, match=r"has both .* and .*, which are one shard; remove one"):
+    with pytest.raises(UserError, match=r"has both .* and .*, which are the same shard; remove one"):
         shard_paths(tmp_path)
 
 
@@ -106,7 +106,7 @@ def test_a_written_shard_has_the_published_layout(tmp_path):
 def test_frames_that_are_no_bytes_are_refused(tmp_path):
     """As of pictures from 0 to 1, of which nothing but black would be left."""
     rows = fake_rows([4])
-    with pytest.raises(UserError, match="observation is of float64; frames are of uint8, from 0 to 255"):
+    with pytest.raises(UserError, match="observation is float64; frames must be uint8, from 0 to 255"):
         write_shard(tmp_path / "0_mine.hdf5", rows | {"observation": rows["observation"] / 255}, {})
     assert not list(tmp_path.iterdir())
 
@@ -167,8 +167,8 @@ def with_value(index, value):
         ("action", lambda v: v[:, 0], r"'action' has shape \(7,\)"),
         ("reward", lambda v: v[:-1], r"'reward' has shape \(6,\), expected \(7,\)"),
         ("reward", lambda v: v[:, None], r"'reward' has shape \(7, 1\)"),
-        ("step_type", lambda v: v + 1, r"'step_type' holds something else"),
-        ("step_type", lambda v: v + 0.5, r"'step_type' holds something else"),
+        ("step_type", lambda v: v + 1, r"'step_type' holds values other"),
+        ("step_type", lambda v: v + 0.5, r"'step_type' holds values other"),
         ("observation", lambda v: v.astype(np.float32), r"'observation' is float32"),
         ("observation", lambda v: v[:, :, :64], r"'observation' is uint8 of shape \(7, 3, 64, 84\)"),
         ("observation", lambda v: v[:0], r"'observation' is uint8 of shape \(0, "),
@@ -186,7 +186,7 @@ def test_truncated_and_foreign_files_are_refused(shard):
     whole = shard.read_bytes()
     for content in (whole[: len(whole) // 2], b"no HDF5 at all" * 100, b""):
         shard.write_bytes(content)
-        with pytest.raises(UserError, match=r"0_fake\.hdf5: is truncated, damaged or no HDF5") as caught:
+        with pytest.raises(UserError, match=r"0_fake\.hdf5: is truncated, damaged or not an HDF5") as caught:
             read_shard(shard)
         assert "\n" not in str(caught.value)
 
@@ -236,7 +236,7 @@ def test_values_in_other_files_are_not_followed(shard, tmp_path, kind):
         outside(file, tmp_path, kind, value)
         np.testing.assert_array_equal(file["reward"], value)
     for read in (read_shard, read_dtypes):
-        with pytest.raises(UserError, match="'reward' lies in another file, which is not followed"):
+        with pytest.raises(UserError, match="'reward' is stored in another file, which is not supported"):
             read(shard)
 
 

@@ -162,10 +162,10 @@ def test_discrete_actions_become_columns(minari, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
-        (lambda frame: {"left": frame, "right": frame}, "Pass --picture, one of left, right"),
-        (lambda frame: frame[:2], "holds no pictures"),
-        (lambda frame: frame.astype(np.float32), "holds no pictures"),
-        (lambda frame: frame[:, :60], "pictures of 60x84 pixels.*pass --size"),
+        (lambda frame: {"left": frame, "right": frame}, "choose one with --picture, of left, right"),
+        (lambda frame: frame[:2], "holds no images"),
+        (lambda frame: frame.astype(np.float32), "holds no images"),
+        (lambda frame: frame[:, :60], "images of 60x84 pixels.*pass --size"),
     ],
 )
 def test_what_is_no_set_of_pictures_is_refused(minari, layout, message, tmp_path):
@@ -210,9 +210,9 @@ def test_minari_writes_to_a_relative_path_and_a_damaged_set_is_told(minari, tmp_
         ({"is_last": np.ones(3)}, "'is_last' has 3 rows, 'reward' 5"),
         ({"is_first": np.ones(6)}, "'is_first' has 6 rows, 'reward' 5"),
         ({"discount": np.ones(1)}, "'discount' has 1 rows, 'reward' 5"),
-        ({"action": np.zeros((5, 3), np.float32)}, "not those of the episodes before"),
-        ({"image": np.zeros((5, 84, 84, 3), np.float32)}, "float32 pictures"),
-        ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "pictures of 32x32 pixels, its set tells of 84x84"),
+        ({"action": np.zeros((5, 3), np.float32)}, "unlike the episodes before"),
+        ({"image": np.zeros((5, 84, 84, 3), np.float32)}, "float32 images"),
+        ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "images of 32x32 pixels, its dataset declares 84x84"),
         *(({key: np.zeros((n, *of), kind) for key, of, kind in KEYS}, "has no step") for n in (0, 1)),
     ],
 )
@@ -247,7 +247,7 @@ def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
     with pytest.raises(UserError, match="call the folder walker-v0"):
         export_set("minari", tmp_path / "own", tmp_path / "walkers" / "walker")
     assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
-    with pytest.raises(UserError, match="test/none-v0: is neither a folder of Minari's nor a set it has"):
+    with pytest.raises(UserError, match="test/none-v0: is neither a Minari folder nor an installed Minari dataset"):
         import_set("minari", "test/none-v0", tmp_path / "set")
 
 
@@ -291,7 +291,7 @@ def test_ogbenchs_arrays_are_of_one_length(key, tmp_path):
     with np.load(path) as stored:
         np.savez(path, **(dict(stored) | {key: stored[key][:4]}))
     told = [4 if name == key else 8 for name in ("observations", "actions", "terminals")]
-    with pytest.raises(UserError, match=r"x-v0.npz: has {} pictures, {} actions and {} terminals".format(*told)):
+    with pytest.raises(UserError, match=r"x-v0.npz: has {} images, {} actions and {} terminals".format(*told)):
         import_set("ogbench", str(path), tmp_path / "set")
     write_ogbench(path, [(np.zeros((1, 64, 64, 3), np.uint8), np.zeros((1, 2), np.float32))])
     with pytest.raises(UserError, match=r"x-v0.npz: episode 0: has no step"):
@@ -315,7 +315,7 @@ def test_minaris_arrays_are_of_one_length(minari, key, tmp_path):
 
 def test_an_ogbench_set_of_states_or_a_cut_file_is_refused(tmp_path):
     states = write_ogbench(tmp_path / "cube-v0.npz", [(np.zeros((3, 28), np.float32), np.zeros((3, 5), np.float32))])
-    with pytest.raises(UserError, match="holds no pictures"):
+    with pytest.raises(UserError, match="holds no images"):
         import_set("ogbench", str(states), tmp_path / "set")
     states.write_bytes(states.read_bytes()[:200])
     with pytest.raises(UserError, match=r"cube-v0.npz: cannot be read as this format"):
@@ -384,7 +384,7 @@ def test_a_cut_import_goes_on_and_ends_in_the_same_files(tmp_path, monkeypatch):
     assert written[0].stat().st_mtime_ns == changed
     assert [shard.read_bytes() for shard in shards] == [shard.read_bytes() for shard in whole]
     other = write_fake_set(tmp_path / "other" / "own", [7, 9, 8, 12, 6], attributes={"task": "walker_walk"})
-    with pytest.raises(UserError, match="with another source"):
+    with pytest.raises(UserError, match="that differs in source"):
         import_set("vd4rl", str(other), tmp_path / "set")
 
 
@@ -455,5 +455,5 @@ def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):
     own = write_fake_set(tmp_path / "own", LENGTHS, attributes={"task": "walker_walk"})
     import_set("vd4rl", str(own), tmp_path / "set")
     DataSet("set", tmp_path / "set", "collect", {"task": "walker_walk"}).check()
-    with pytest.raises(UserError, match="holds a set of walker_walk, the grid says cheetah_run"):
+    with pytest.raises(UserError, match="holds a dataset of walker_walk, the grid says cheetah_run"):
         DataSet("set", tmp_path / "set", "collect", {"task": "cheetah_run"}).check()

@@ -161,7 +161,7 @@ def test_one_of_several_cameras(exported, tmp_path):
 
     rewrite(exported[0], second)
     tell(exported[0], lambda i: i["features"].update({"observation.images.top": i["features"]["observation.image"]}))
-    with pytest.raises(UserError, match=r"Pass --picture, one of observation.image, observation.images.top"):
+    with pytest.raises(UserError, match=r"choose one with --picture, of observation.image, observation.images.top"):
         import_set("lerobot", str(exported[0]), tmp_path / "back")
     import_set("lerobot", str(exported[0]), tmp_path / "back", picture="observation.images.top")
     frames = rows_of_set(exported[1])[FRAMES_KEY]
@@ -171,7 +171,7 @@ def test_one_of_several_cameras(exported, tmp_path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda out: (out / "meta" / "info.json").unlink(), "no LeRobot set on this disk"),
+        (lambda out: (out / "meta" / "info.json").unlink(), "not a local LeRobot dataset"),
         (lambda out: tell(out, lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
         (lambda out: tell(out, lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
         (lambda out: tell(out, lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
@@ -182,8 +182,8 @@ def test_one_of_several_cameras(exported, tmp_path):
         (lambda out: tell(out, lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
         (lambda out: (out / DATA).unlink(), "No such file"),
         (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
-        (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "has not the rows"),
-        (lambda out: tell(out, lambda info: info["features"].pop("observation.image")), "holds no pictures"),
+        (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "lacks rows"),
+        (lambda out: tell(out, lambda info: info["features"].pop("observation.image")), "holds no images"),
     ],
 )
 def test_what_cannot_be_read_is_told(exported, damage, message, tmp_path):

@@ -247,7 +247,9 @@ def test_the_shards_tell_the_size_of_the_frames(tmp_path, size):
 def test_shards_of_two_frame_sizes_are_refused(tmp_path):
     with_frames(tmp_path / "set", 84)
     with_frames(tmp_path / "set", 64, number=1)
-    with pytest.raises(UserError, match=r"1_fake.hdf5: has frames of 64x64 pixels, 0_fake.hdf5 of 84x84; keep one set"):
+    with pytest.raises(
+        UserError, match=r"1_fake.hdf5: has frames of 64x64 pixels, 0_fake.hdf5 of 84x84; keep one dataset"
+    ):
         open_store(tmp_path / "set", tmp_path / "cache")
 
 

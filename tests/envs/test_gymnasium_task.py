@@ -165,14 +165,14 @@ def test_an_environment_is_made_by_its_id_with_its_arguments():
         ({"space": gymnasium.spaces.Discrete(3)}, r"has the actions Discrete\(3\)"),
         (
             {"space": gymnasium.spaces.Box(-3, 3, (2,), np.int64)},
-            r"has the actions Box\(-3, 3, \(2,\), int64\): only a",
+            r"has the actions Box\(-3, 3, \(2,\), int64\), but a",
         ),
-        ({"space": gymnasium.spaces.Box(-1, 1, (0,))}, r"has the actions Box\(.*only a bounded Box"),
+        ({"space": gymnasium.spaces.Box(-1, 1, (0,))}, r"has the actions Box\(.*needs a bounded Box"),
         ({"high": np.inf}, "Counter has actions from -1 to inf: only bounds within -1e[+]09 and 1e[+]09 can be"),
         ({"low": -1e10}, "Counter has actions from -1e[+]10 to 1: only bounds"),
-        ({"shape": (20,)}, r"Counter shows uint8 of shape \(20,\) by its render\(\)"),
-        ({"shape": (20, 30, 4)}, r"Counter shows uint8 of shape \(20, 30, 4\)"),
-        ({"shape": (0, 30, 3)}, r"Counter shows uint8 of shape \(0, 30, 3\)"),
+        ({"shape": (20,)}, r"Counter returns uint8 of shape \(20,\) from its render\(\)"),
+        ({"shape": (20, 30, 4)}, r"Counter returns uint8 of shape \(20, 30, 4\)"),
+        ({"shape": (0, 30, 3)}, r"Counter returns uint8 of shape \(0, 30, 3\)"),
     ],
 )
 def test_what_can_be_no_task_is_one_line(arguments, message):

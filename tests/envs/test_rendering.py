@@ -29,7 +29,7 @@ def test_a_dm_control_of_another_mujoco_is_one_line(task, monkeypatch):
         raise AttributeError("'MjModel' object has no attribute 'flex_evpair'")  # as of 1.0.44 with mujoco 3.17.0
 
     monkeypatch.setattr("dm_control.mujoco.Physics.from_xml_string", load)
-    with pytest.raises(UserError, match=r"does not go with mujoco .*flex_evpair.*dm-control==1\.0\.44") as caught:
+    with pytest.raises(UserError, match=r"is incompatible with mujoco .*flex_evpair.*dm-control==1\.0\.44") as caught:
         make_env(TASKS[task])
     assert "\n" not in str(caught.value)
 

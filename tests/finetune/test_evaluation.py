@@ -229,8 +229,8 @@ def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, r
     assert rows[: len(before)] == before
     assert [row["evaluated_under"] for row in rows[len(before) :]] == ["patch"] * 2 + ["patch, patch_size 24"] * 2
     for wrong, told in (
-        (["--corruption", "patch"], "episodes.csv has 2 episodes under patch; leave --keep out"),
-        ([], "--keep is for a corruption that --corruption names"),
+        (["--corruption", "patch"], "episodes.csv already has 2 episodes under patch; leave --keep out"),
+        ([], "--keep needs --corruption"),
     ):
         with pytest.raises(SystemExit) as end:
             main([*words, *wrong])
@@ -240,7 +240,7 @@ def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, r
     assert found["evaluated_under"].tolist() == ["patch", "patch, patch_size 24"]
     assert found["score"].tolist() == pytest.approx([1.175, 1.175])
     (run / "timing.json").unlink()
-    with pytest.raises(UserError, match="has not finished"):
+    with pytest.raises(UserError, match="is not finished"):
         evaluation.refuse_kept(run, "truncate")
 
 

@@ -214,12 +214,12 @@ def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_pat
 @pytest.mark.parametrize(
     ("first", "second", "told"),
     [
-        ("", "--batch-size 8", "do not stack: --batch-size is 4 there and 8 here"),
-        ("", "--algorithm iql", "do not stack: --algorithm is td3_bc there and iql here"),
-        ("", "--alpha 5", "do not stack: --alpha is 2.5 there and 5.0 here"),
-        ("", "--encoder {state} --data {states}", "do not stack: the representations' width is 32 there and 18 here"),
-        ("", "--encoder {drq_bc}", "b: drq_bc trains its encoder, too, and does not stack"),
-        ("--views 0", "--views 0", "a: --views 0 encodes every batch anew and does not stack"),
+        ("", "--batch-size 8", "cannot be stacked: --batch-size is 4 and 8"),
+        ("", "--algorithm iql", "cannot be stacked: --algorithm is td3_bc and iql"),
+        ("", "--alpha 5", "cannot be stacked: --alpha is 2.5 and 5.0"),
+        ("", "--encoder {state} --data {states}", "cannot be stacked: the representations' width is 32 and 18"),
+        ("", "--encoder {drq_bc}", "b: drq_bc also trains its encoder and cannot be stacked"),
+        ("--views 0", "--views 0", "a: --views 0 encodes every batch and cannot be stacked"),
         ("", "--out {out}/a", "a is given twice: a folder holds one run"),
         ("--seeds 0,0", "", "--seeds is '0,0': give different whole numbers"),
         ("--seeds 0,1 --seed 3", "", "--seed and --seeds are both given"),

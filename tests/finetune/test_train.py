@@ -153,7 +153,7 @@ def test_sets_that_an_encoder_cannot_read_are_one_line(encoder, data, tmp_path):
     config = json.loads((tmp_path / "small" / "config.json").read_text())
     config["encoder"]["size"] = 64
     (tmp_path / "small" / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match=r"small: this encoder reads pictures of 64x64 pixels, the data set has 84x84"):
+    with pytest.raises(UserError, match=r"small: this encoder reads images of 64x64 pixels, the dataset has 84x84"):
         run_finetune(smoke_finetune(tmp_path / "small", data, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 

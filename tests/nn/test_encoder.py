@@ -61,7 +61,7 @@ def test_what_would_be_another_encoder_is_refused(changes, message):
 def test_observations_of_another_shape_are_refused():
     encoder, other = make("gru", True), window()
     for obs in (other.obs[..., :64, :64], other.obs[:, :, :3]):
-        with pytest.raises(UserError, match=r"reads observations of shape \(9, 84, 84\), and these are of \("):
+        with pytest.raises(UserError, match=r"reads observations of shape \(9, 84, 84\), not \("):
             encoder.encode(other.replace(obs=obs))
         with pytest.raises(UserError, match="pretrain an encoder on these"):
             encoder.step(obs[:, 0], other.prev_action[:, 0], encoder.initial_state(len(obs)))
@@ -161,7 +161,7 @@ def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
         load_encoder(tmp_path, action_dim=6)
     with pytest.raises(UserError, match="pretrained on walker_walk, not on cheetah_run"):
         load_encoder(tmp_path, task="cheetah_run")
-    with pytest.raises(UserError, match=r"pictures of 84x84 pixels, the data set has 50x50"):
+    with pytest.raises(UserError, match=r"images of 84x84 pixels, the dataset has 50x50"):
         load_encoder(tmp_path, size=50)
     (tmp_path / "model.safetensors").write_bytes(b"damaged")
     with pytest.raises(UserError, match="cannot be read"):

@@ -116,5 +116,5 @@ def test_absent_weights_and_other_channels_are_one_line(model: Path):
         make("pretrained", model="nobody/nothing")
     from vd4rl_pomdp.nn.pretrained import Pretrained
 
-    with pytest.raises(UserError, match="4 are no frames"):
+    with pytest.raises(UserError, match="needs frames of 3 channels, not 4"):
         Pretrained(str(model), SIZE, "", 4)

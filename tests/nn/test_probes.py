@@ -71,5 +71,5 @@ def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation(r
 
 @pytest.mark.parametrize("number", [0, 5])
 def test_one_episode_alone_has_none_to_be_tested_on(random, number):
-    with pytest.raises(UserError, match="one alone is too few"):
+    with pytest.raises(UserError, match="needs at least two episodes"):
         probe_error(random.normal(size=(20, 3)), random.normal(size=(20, 2)), np.full(20, number))

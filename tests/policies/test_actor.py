@@ -82,12 +82,12 @@ HEADS = ("mean", "log_std")
 def test_whole_files_whose_weights_are_no_actor_are_refused(tmp_path, how):
     shipped, path = load_actor("walker_walk", "medium"), tmp_path / "actor.safetensors"
     Actor(spoil(shipped.weights, how), shipped.card).save(path)
-    with pytest.raises(UserError, match="its weights form no actor of walker_walk"):
+    with pytest.raises(UserError, match="its weights do not fit an actor of walker_walk"):
         read_actor(path, "walker_walk")
 
 
 def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
-    with pytest.raises(UserError, match="form no actor"):
+    with pytest.raises(UserError, match="do not fit an actor"):
         read_actor(actor.ASSETS / "walker_walk_replay.safetensors")
     with pytest.raises(UserError, match="holds no ladder"):
         read_ladder(actor.ASSETS / "walker_walk_medium.safetensors")

@@ -109,7 +109,7 @@ def test_a_gap_beyond_the_window_is_refused(max_k, window):
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
         ({"method": "mik", "history": "none"}, "unknown --history 'none': choose one of method, gru"),
         ({"method": "bc", "history": "gru"}, "bc has no memory"),
-        ({"method": "integrator", "history": "gru"}, "integrator has the memory that its name tells"),
+        ({"method": "integrator", "history": "gru"}, "integrator implies its memory"),
     ],
 )
 def test_values_that_cannot_work_are_refused(settings, message):

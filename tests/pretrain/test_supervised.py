@@ -155,7 +155,7 @@ def test_a_set_without_states_or_with_one_only_is_refused_in_a_line(data, with_s
     assert "stores no simulator states" in line
     assert not (tmp_path / "run").exists()
     with_states.physics[:] = 3
-    with pytest.raises(UserError, match="states in this set are all the same"):
+    with pytest.raises(UserError, match="states in this dataset are equal"):
         made(with_states, tmp_path, "supervised")
 
 

@@ -46,7 +46,7 @@ def test_an_encoder_tells_how_it_was_pretrained(encoder):
 def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, tmp_path):
     run_pretrain(smoke_pretrain(data, tmp_path / "run"))
     before = contents(tmp_path / "run")
-    with pytest.raises(UserError, match=r"another config \(seed\)"):
+    with pytest.raises(UserError, match=r"a different config \(seed\)"):
         run_pretrain(smoke_pretrain(data, tmp_path / "run", seed=1))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")
@@ -68,7 +68,7 @@ def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, 
         ({"zeroed_frames": 4}, "cannot zero 4 of 3"),
         ({"device": "meta"}, "unknown device 'meta'"),
         ({"frame_encoder": "state"}, "stores no simulator states"),
-        ({"task": "cheetah_run"}, "is a set of walker_walk, not of cheetah_run"),
+        ({"task": "cheetah_run"}, "is a dataset of walker_walk, not of cheetah_run"),
     ],
 )
 def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message):
@@ -81,7 +81,7 @@ def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message)
 def test_a_set_without_a_transition_is_refused_whatever_the_method(tmp_path, method):
     """Advice such as fewer codes or a shorter window leads nowhere there."""
     data = write_fake_set(tmp_path / "walker_walk" / "expert", (1, 1, 1), complete_last=False)
-    with pytest.raises(UserError, match="a single row: take another set"):
+    with pytest.raises(UserError, match="a single row: choose another dataset"):
         run_pretrain(smoke_pretrain(data, tmp_path / "out", method=method))
     assert not (tmp_path / "out").exists()
 

@@ -53,7 +53,7 @@ def test_nested_state_comes_back_as_it_was():
     assert torch.equal(fresh.state_dict()["state"][0]["exp_avg"], optimiser.state_dict()["state"][0]["exp_avg"])
     assert (loaded["step"], loaded["note"], loaded["none"]) == (3, "x", None)
     assert len(pack({"row": torch.zeros(1000, 1000)[0]})) < 10_000, "a part does not bring the whole along"
-    with pytest.raises(UserError, match="a checkpoint cannot keep noise/0, which is a float64: give a tensor"):
+    with pytest.raises(UserError, match="a checkpoint cannot store noise/0, which is a float64: use a tensor"):
         pack({"noise": [np.float64(1.0)]})
 
 

@@ -50,7 +50,7 @@ def test_a_scalar_counts_the_steps_that_gave_it_and_each_row_begins_anew():
 
 @pytest.mark.parametrize("name", ["step", "eval/return/none"])
 def test_a_scalar_has_no_name_that_is_anothers(name):
-    with pytest.raises(UserError, match=f"is called '{name}', as something else is in metrics.jsonl"):
+    with pytest.raises(UserError, match=f"is called '{name}', which metrics.jsonl uses already"):
         Means().add(logs({"loss": 1.0, name: 2.0}))
 
 

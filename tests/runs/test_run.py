@@ -43,9 +43,9 @@ def test_only_the_same_run_resumes_wherever_its_data_lies(tmp_path):
     assert before.keys() == {"config.json", "machine.json", "timing.json"}
     with begin(tmp_path, data=Path("moved"), workers=7, log_every=9) as again:
         assert again.finished
-    with pytest.raises(UserError, match=r"another config \(seed\)"):
+    with pytest.raises(UserError, match=r"a different config \(seed\)"):
         begin(tmp_path, seed=1)
-    with pytest.raises(UserError, match=r"other content of --data \(data was abc and is xyz\); give it what it began"):
+    with pytest.raises(UserError, match=r"other content of --data \(data was abc and is xyz\); restore what it began"):
         begin(tmp_path, {"data": "xyz"})
     with pytest.raises(UserError, match=r"stage stage"):
         RunFolder(tmp_path, "other", Config(tmp_path), INPUTS)

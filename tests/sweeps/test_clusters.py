@@ -78,7 +78,7 @@ def test_what_slurm_refuses_or_does_not_answer_is_one_line_and_stopping_asks_bef
 ):
     task = ClusterTask(tmp_path, "", LocalOptions(), str(tmp_path))
     cluster = fakes(sbatch="echo invalid partition >&2; exit 1")
-    with pytest.raises(UserError, match=r"Slurm took no array .*invalid partition"):
+    with pytest.raises(UserError, match=r"Slurm rejected the job array .*invalid partition"):
         cluster.submit(task, 2)
     cluster = fakes()
     cluster.submit(task, 3)
@@ -130,7 +130,7 @@ def test_without_slurms_commands_one_is_told_where_to_start(tmp_path, monkeypatc
 
 
 class Vain:
-    """A cluster whose tasks end before they begin a job, after one look at which it does not answer."""
+    """A cluster whose tasks end before they start a job, after one look at which it does not answer."""
 
     folder, tasks = Path("tasks"), 2
 
@@ -155,7 +155,7 @@ def test_a_cluster_that_does_nothing_ends_the_sweep_and_one_that_falls_silent_is
 ):
     monkeypatch.setattr(clusters, "LOOK_S", 0.0)
     plan, cluster = keep_plan(tmp_path, *(job(tmp_path, name) for name in "abc")), Vain()
-    with pytest.raises(UserError, match="tasks end before they begin a job: see tasks"):
+    with pytest.raises(UserError, match="tasks end before they start a job: see tasks"):
         watch([plan], cluster, SweepFolder(tmp_path), "plan")
     assert cluster.asked == [2] * 3, "as many as the jobs need, and no more than it may have"
     assert cluster.stopped
@@ -165,7 +165,7 @@ def test_a_cluster_that_does_nothing_ends_the_sweep_and_one_that_falls_silent_is
 def test_a_task_is_asked_for_a_stack(fakes, tmp_path, monkeypatch):
     monkeypatch.setattr(clusters, "LOOK_S", 0.0)
     plan, cluster = keep_plan(tmp_path, *(policy(tmp_path, name) for name in "abc")), Vain(stack=3)
-    with pytest.raises(UserError, match="tasks end before they begin a job"):
+    with pytest.raises(UserError, match="tasks end before they start a job"):
         watch([plan], cluster, SweepFolder(tmp_path), "plan")
     assert cluster.asked == [1] * 3
     assert fakes(stack=5).local == LocalOptions(1, 1, stack=5)

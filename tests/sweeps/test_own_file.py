@@ -81,5 +81,5 @@ def test_a_part_that_no_file_tells_of_is_refused_before_anything_runs(tmp_path, 
         with pytest.raises(SystemExit) as end:
             main(["sweep", "run", str(tmp_path / "grid.toml"), "--out", str(tmp_path / "runs")])
     assert end.value.code == 2
-    assert "error: algorithm mine: was registered in this process alone" in capsys.readouterr().err
+    assert "error: algorithm mine: is registered only in this process" in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()

@@ -266,9 +266,13 @@ def collected(**settings):
 @pytest.mark.parametrize(
     ("stored", "asked", "message"),
     [
-        ({"episodes": 3}, "collect.episodes=200", "a set of episodes 3, the grid says episodes 200; choose another"),
-        ({}, "collect.frame_size=48", "a set of the default frame_size, the grid says frame_size 48"),
-        ({"frame_size": 48}, "collect.seed=0", "a set of frame_size 48, the grid says the default frame_size"),
+        (
+            {"episodes": 3},
+            "collect.episodes=200",
+            "a dataset of episodes 3, the grid says episodes 200; choose another",
+        ),
+        ({}, "collect.frame_size=48", "a dataset of the default frame_size, the grid says frame_size 48"),
+        ({"frame_size": 48}, "collect.seed=0", "a dataset of frame_size 48, the grid says the default frame_size"),
     ],
 )
 def test_a_set_that_was_collected_otherwise_is_refused(copy, stored, asked, message):
@@ -363,7 +367,7 @@ def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_t
     words = [str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit, match="2"):
         main(["sweep", "run", *words])
-    assert f"{name}: holds no set, and the quality '{name}' cannot be collected" in capsys.readouterr().err
+    assert f"{name}: holds no dataset, and the quality '{name}' cannot be collected" in capsys.readouterr().err
     write_fake_set(tmp_path / "out" / "data" / "walker_walk" / name, [20, 25, 30])
     main(["sweep", "run", *words])
     assert capsys.readouterr().out == "all 2 jobs are finished\n"
@@ -379,5 +383,5 @@ def test_a_set_of_another_task_is_refused(tmp_path):
     shard = min((tmp_path / "data" / "walker_walk" / "expert").glob("*.hdf5"))
     with h5py.File(shard, "a") as file:
         file.attrs["vd4rl_pomdp"] = '{"task": "cheetah_run"}'
-    with pytest.raises(UserError, match="expert: holds a set of cheetah_run, the grid says walker_walk"):
+    with pytest.raises(UserError, match="expert: holds a dataset of cheetah_run, the grid says walker_walk"):
         plan(tmp_path)

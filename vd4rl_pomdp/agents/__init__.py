@@ -86,13 +86,13 @@ def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
     folder = next((place for place in (SHIPPED / name, Path(name)) if (place / CARD).exists()), None)
     if folder is None:
         raise UserError(
-            f"unknown agent {str(name)!r}: it is no folder with {CARD}, as `agents export` and `hub pull` write, and "
-            f"the package ships {', '.join(shipped()) or 'none'}"
+            f"unknown agent {str(name)!r}: name a folder written by `agents export` or `hub pull`, or a shipped "
+            f"agent ({', '.join(shipped()) or 'none'})"
         )
     card = read_json(folder / CARD)
     about = read_json(folder / FILES[0]).get("pretrain", {}) if card.get("sha256") == checksums(folder) else {}
     if not about or any(card.get(name) != about[name] for name in ("task", "method", "corruption")):
-        raise UserError(f"{folder}: its files are not those that {CARD} tells of; take another copy")
+        raise UserError(f"{folder}: its files do not match {CARD}; copy it again")
     return folder, card
 
 

@@ -53,7 +53,7 @@ def apart(function: str, *arguments: Any, count: int = 1, **environment: str) ->
     processes: list[Any] = [subprocess.Popen(words, env=os.environ | environment, **pipes) for _ in range(count)]
     try:
         if not all(process.stdout.readline() for process in processes):
-            raise WorkerDiedError("a measuring process ended without an answer")
+            raise WorkerDiedError("a benchmark process ended without a result")
         for process in processes:
             process.stdin.write("\n")
             process.stdin.flush()

@@ -31,7 +31,7 @@ COMMANDS = {
     "data parity": ("data.parity", "compare rendered pixels with the data's"),
     "agents export": ("hub.export", "a fine-tuned run's encoder and policy as one small folder"),
     "agents play": ("hub.play", "the same episodes by several agents: returns, and a film side by side"),
-    "hub push": ("hub.push", "write an encoder, an agent or a data set to the Hugging Face Hub"),
+    "hub push": ("hub.push", "write an encoder, an agent or a dataset to the Hugging Face Hub"),
     "hub pull": ("hub.pull", "fetch and check what was pushed"),
     "pretrain": ("stages.pretrain", "train an encoder"),
     "finetune": ("stages.finetune", "train a policy on a frozen encoder, by TD3+BC or another algorithm"),

@@ -139,8 +139,8 @@ def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
     error = result["replay_max_error"]
     if error is not None and error > REPLAY_TOLERANCE:
         raise UserError(
-            f"{set}: stored actions do not replay to what is stored (largest difference {error}, where "
-            f"{REPLAY_TOLERANCE} would be rounding)"
+            f"{set}: replaying the stored actions does not give the stored values (largest difference {error}, "
+            f"tolerance {REPLAY_TOLERANCE})"
         )
 
 
@@ -157,9 +157,9 @@ def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) ->
     result = check_parity(set)
     show(result, json)
     if not result["equal"] and set:
-        raise UserError(f"the environment shows another background than {set}: see `background` above")
+        raise UserError(f"the environment's background differs from that of {set}: see `background` above")
     if not result["equal"]:
         raise UserError(
-            f"{result['render']['gl_renderer']} draws other pixels than the golden frames' software renderer did: name "
-            "a set, to see whether they are its own"
+            f"{result['render']['gl_renderer']} renders other pixels than the golden frames' software renderer: name "
+            "a dataset to compare with that instead"
         )

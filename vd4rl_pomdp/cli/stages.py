@@ -120,7 +120,7 @@ def evaluate(words: list[str], program: str) -> None:
             append_episodes(out, [])  # fail before playing if the file cannot be written
     options = {name: value for stage in asked.stages for name, value in flat(stage).items()}
     if asked.keep and asked.corruption is None:
-        raise UserError("--keep is for a corruption that --corruption names: a run's own evaluations are kept already")
+        raise UserError("--keep needs --corruption: a run's own evaluations are kept already")
     if asked.keep and there:
         refuse_kept(run, another(trained, asked.corruption or "", options)[1])
     rows, played = evaluate_run(run, asked.corruption, asked.episodes, asked.workers, **options)

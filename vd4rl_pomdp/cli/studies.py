@@ -43,7 +43,7 @@ def report(
 
         choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
     elif only or change:
-        raise UserError("--only and --change are about a grid's cells: name it with --grid")
+        raise UserError("--only and --change select and change the cells of a grid: name it with --grid")
     written = write_report(_named(runs), out, choice)
     print_summary(written)
     for sentence in written.unlike:
@@ -54,7 +54,7 @@ def report(
 def _named(runs: list[Path]) -> list[Path]:
     """The folders of a command line; UserError if there are none."""
     if not runs:
-        raise UserError("no runs are named: name at least one folder")
+        raise UserError("no runs given: name at least one folder")
     return runs
 
 

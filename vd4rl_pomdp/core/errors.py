@@ -134,7 +134,7 @@ def refuse_no_folder(path: Path) -> None:
         except OSError as error:
             raise disk_error(path, error) from error
         if not S_ISDIR(mode):
-            raise UserError(f"{path}: {place} is no folder; choose another folder")
+            raise UserError(f"{path}: {place} is not a folder; choose another folder")
         return
 
 

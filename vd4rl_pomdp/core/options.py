@@ -171,8 +171,8 @@ def flat(config: Any) -> dict[str, Any]:
     for owner, name, value in settings(config):
         if name in found:
             raise UserError(
-                f"{owners[name]} and {owner} both have the setting {name!r}, and {flag_of(name)} cannot set two: "
-                "rename it in the part of your own"
+                f"{owners[name]} and {owner} both have the setting {name!r}, so {flag_of(name)} would be ambiguous: "
+                "rename it in your own part"
             )
         found[name], owners[name] = value, owner
     return found

@@ -36,7 +36,7 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
         # An empty word would parse as Path("."): `--out "$UNSET"` would write to the working directory.
         if not word or (word.startswith("--") and word.endswith("=")):
             name = word.rstrip("=") or (before if before.startswith("--") else "a word")
-            raise UserError(f"{name} is empty: is a variable of the shell not set? (see `{program} --help`)")
+            raise UserError(f"{name} is empty: is a shell variable unset? (see `{program} --help`)")
     words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
     options = {} if default is None else {"default": default}
     shown = io.StringIO()
@@ -53,7 +53,7 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
     for word, after in pairwise([*words, "--"]):
         # tyro accepts an empty list, and `sweep run GRID --only $UNSET` would run everything
         if after.startswith("--") and told.get(word.removeprefix("--").replace("-", "_")) in ([], ()):
-            raise UserError(f"{word} has no value: is a variable of the shell not set? (see `{program} --help`)")
+            raise UserError(f"{word} has no value: is a shell variable unset? (see `{program} --help`)")
     return parsed
 
 

@@ -26,7 +26,7 @@ _PARSING = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFErro
 def regular(path: Path) -> Path:
     """Return `path`; UserError for a folder, or for a pipe or device, which may never end."""
     if path.exists() and not path.is_file():
-        raise UserError(f"{path}: is no regular file but a folder, a pipe or a device; remove it or name another")
+        raise UserError(f"{path}: is a folder, a pipe or a device, not a regular file; remove it or name another")
     return path
 
 

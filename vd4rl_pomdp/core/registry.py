@@ -91,7 +91,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._load_offered()
         if name in self.broken and name not in self._parts:
             raise UserError(
-                f"{self.kind} {name!r} cannot be loaded ({self.broken[name]}): mend or remove what offers it"
+                f"{self.kind} {name!r} cannot be loaded ({self.broken[name]}): fix or uninstall its package"
             )
         refuse_unknown(self.kind, name, self._parts, OR_ONES_OWN)
         return self._parts[name]
@@ -120,8 +120,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
         if name in ("", ".", "..") or any(sign in name for sign in "/,= "):
             raise UserError(
-                f"{self.kind} {name!r}: folders and `--only` are made of names, without slashes, commas, blanks or "
-                "equals signs: choose another"
+                f"{self.kind} {name!r}: folders and `--only` contain names, so they must be without slashes, commas, "
+                "blanks and equals signs: choose another"
             )
         try:
             self._refuse(name, part)

@@ -214,7 +214,7 @@ def _kinds(corruption: str) -> list[type[Options]]:
     if len(kinds) < len(names) or any(map(_drops, kinds[:-1])):
         last = " or ".join(name for name, kind in STAGES.items() if _drops(kind))
         raise UserError(
-            f"unknown corruption {corruption!r}: a name joins stages by +, each once, and {last} may only end it"
+            f"unknown corruption {corruption!r}: join stages with +, each at most once, with {last} only at the end"
         )
     return kinds
 

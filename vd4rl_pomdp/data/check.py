@@ -90,11 +90,11 @@ def _check_actions(dataset: Dataset) -> None:
     first = dataset.episode_start.numpy()
     if action[first].any() or reward[first].any():
         raise UserError(
-            f"{dataset.path}: an episode's first row has an action or a reward, which led to no frame: store each with "
-            "the frame that follows it, and zeros in the first row"
+            f"{dataset.path}: an episode's first row has a nonzero action or reward: store each with the frame that "
+            "follows it, and zeros in the first row"
         )
     if (most := np.abs(action).max()) > 1:
-        raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], as policies act")
+        raise UserError(f"{dataset.path}: has actions up to {most!s}: scale them to [-1, 1], as policies act")
 
 
 def _why_not_replayed(dataset: Dataset) -> str:
@@ -103,7 +103,7 @@ def _why_not_replayed(dataset: Dataset) -> str:
     assert dataset.task is not None
     task = TASKS.named(dataset.task)
     if not isinstance(task, DMCTask):
-        return f"impossible: {dataset.task} is no task of dm_control"
+        return f"impossible: {dataset.task} is not a task of dm_control"
     from vd4rl_pomdp.envs.dmc import replays
 
     return "" if replays(task) else f"impossible: {dataset.task} draws more than the simulator state for each episode"
@@ -125,7 +125,7 @@ def _replay_error(
         except (RuntimeError, ValueError) as error:  # from dm_control, for example if the simulation diverges
             raise UserError(
                 f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
-                f"({first_line(error)}); put the set in a folder called like its task, or collect it again"
+                f"({first_line(error)}); put the dataset in a folder named after its task, or collect it again"
             ) from error
         worst = np.maximum(worst, np.abs(replayed - stored[start + 1 : end]).max())  # unlike max(), propagates NaN
     return float(worst)

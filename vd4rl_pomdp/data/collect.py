@@ -148,19 +148,19 @@ def check_config(config: CollectConfig) -> None:
     base = _base(config)
     layout = layout_of(task)  # also refuses an environment that cannot be built
     if not layout.state_dim and base != "random":
-        raise UserError(
-            f"{config.task} has no states for an actor to read: --quality random, or a set of your own in this format"
-        )
+        raise UserError(f"{config.task} has no states for an actor to read: use --quality random, or your own dataset")
     if base == "medium_expert" and config.episodes < 2:
         raise UserError(f"--episodes must be at least 2 for {config.quality}, which is half medium and half expert")
     if config.actor is not None and base not in ("medium", "expert"):
-        raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
+        raise UserError(
+            f"--actor is for medium or expert datasets, not {config.quality}: leave it out or change --quality"
+        )
     if config.action_noise is not None and config.quality in NOISY_QUALITIES:
         raise UserError(
-            f"{config.quality} has its own noise: leave --action-noise out, or take --quality {base} with it"
+            f"{config.quality} has its own noise: leave --action-noise out, or use it with --quality {base}"
         )
     if config.quality in NOISY_QUALITIES and task.action_noise is None:
-        raise UserError(f"{config.task} names no noise of its own: take --quality {base} with --action-noise")
+        raise UserError(f"{config.task} has no action_noise: use --quality {base} with --action-noise")
 
 
 def _base(config: CollectConfig) -> str:

@@ -110,7 +110,9 @@ class Dataset:
     def require_transitions(self) -> None:
         """Raise UserError if the data set has no transition."""
         if not self.num_transitions:
-            raise UserError(f"{self.path}: holds no transition; every episode in it is a single row: take another set")
+            raise UserError(
+                f"{self.path}: holds no transitions, since every episode has a single row: choose another dataset"
+            )
 
     @property
     def action_dim(self) -> int:
@@ -120,10 +122,10 @@ class Dataset:
     def require_states(self) -> None:
         """Raise UserError if the data set has no simulator states, or its task is unknown."""
         if self.physics is not None and self.task is None:
-            raise UserError(f"{self.path}: has physics but names no task; put it in a folder called like its task")
+            raise UserError(f"{self.path}: has physics but names no task; put it in a folder named after its task")
         if self.physics is None:
             raise UserError(
-                f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
+                f"{self.path}: stores no simulator states; `data collect` stores those of dm_control's tasks"
             )
 
     def rows_of(self, episode: int | range) -> slice:
@@ -160,7 +162,7 @@ class Dataset:
         except torch.OutOfMemoryError as error:
             raise OutOfMemoryError(
                 f"{self.path}: {self.frames.nbytes / 1e9:.1f} GB of frames exceed the free memory of {device}: "
-                "choose --device cpu, a smaller set, or fewer runs a GPU"
+                "choose --device cpu, a smaller dataset, or fewer runs per GPU"
             ) from error
         return self
 
@@ -270,8 +272,8 @@ class Dataset:
             episode = int(short[0])
             raise UserError(
                 f"{self.path}: episode {episode} has {rows[episode]} rows, fewer than the window of {length} "
-                f"({len(short)} such episodes); choose a window of at most {rows[short].min()}, or take "
-                "them out of the set"
+                f"({len(short)} such episodes); choose a window of at most {rows[short].min()}, or remove "
+                "them from the dataset"
             )
 
     @property

@@ -34,7 +34,7 @@ def check_endpoint(endpoint: str, name: str) -> None:
         parts = urlsplit(endpoint)
         if parts.scheme in ("http", "https") and parts.hostname:
             return
-    raise UserError(f"{name} {endpoint!r} is no address; it starts with https:// or http://")
+    raise UserError(f"{name} {endpoint!r} is not an address; it must start with https:// or http://")
 
 
 def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:

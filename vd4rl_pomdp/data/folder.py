@@ -90,14 +90,14 @@ def shard_paths(folder: Path) -> list[Path]:
     if folder.is_file():
         return [folder]
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
+        raise UserError(f"{folder}: no such folder; collect or download a dataset there with `vd4rl-pomdp data`")
     if (folder / PLAN).exists() and not (folder / PROVENANCE).exists():
-        raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
+        raise UserError(f"{folder}: the dataset's collection is not finished; re-run the command that collects it")
     shards = shard_files(folder)
     if not shards:
         with disk_errors(folder):
             first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
-        hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a set there"
+        hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a dataset there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
     _refuse_part(folder, shards)
     _refuse_misnumbered(folder, shards)
@@ -122,15 +122,15 @@ def _refuse_misnumbered(folder: Path, shards: Sequence[Path]) -> None:
     for shard in sorted(shards):
         rest, number = _shard_number(shard)
         if twin := alike[rest].get(number):
-            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are one shard; remove one")
+            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are the same shard; remove one")
         alike[rest][number] = shard
     for rest, found in alike.items():
         numbers = sorted(number for number in found if number is not None)
         if numbers != list(range(len(numbers))):
             lacking = min(set(range(len(numbers))) - set(numbers))
             raise UserError(
-                f"{folder}: has the shard {numbers[-1]}{rest}, but none called {lacking}{rest}; download or collect it "
-                "again, or number the shards of a set of your own 0, 1, 2, ..."
+                f"{folder}: has the shard {numbers[-1]}{rest}, but not {lacking}{rest}; download or collect it again, "
+                "or number the shards of your own dataset 0, 1, 2, ..."
             )
 
 
@@ -150,7 +150,7 @@ def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
     command = f"vd4rl-pomdp data download --task {task} --quality {quality} --out {out}"
     raise UserError(
         f"{path}: is a part of V-D4RL's {task} {quality}, {len(shards)} of {len(wanted)} shards ({missing[0]} is "
-        f"missing); get the rest with `{command}`, or give the shards other names to train on them alone"
+        f"missing); get the rest with `{command}`, or rename the shards to train on them alone"
     )
 
 
@@ -166,7 +166,7 @@ def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str 
 def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:
     stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
     if len(stored) > 1:
-        raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
+        raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one dataset per folder")
     folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's own name has priority
     named = (part for part in reversed(folders) if part in choices)
     return stored.pop() if stored else next(named, None)
@@ -189,11 +189,11 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
         if expected.keys() != part.keys():
             key = min(expected.keys() ^ part.keys())
             having, lacking = (shard, first) if key in part else (first, shard)
-            raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one set in a folder")
+            raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one dataset per folder")
         for key, value in part.items():
             if value.shape[1:] != expected[key].shape[1:]:
                 widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
-                raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
+                raise UserError(f"{shard}: {key!r} has {widths}; keep one dataset per folder")
     starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     _check_order(shards, starts, rows["step_type"])
@@ -207,7 +207,7 @@ def check_count(path: Path, episodes: int) -> None:
     planned = plan.get("episodes", plan.get("trajectories", episodes))  # the commands use either name
     if episodes != planned:
         raise UserError(
-            f"{path}: holds {episodes} episodes, its {PLAN} says {planned}: is a shard missing or of another set? "
+            f"{path}: holds {episodes} episodes, its {PLAN} says {planned}: is a shard missing or of another dataset? "
             "collect or download it again"
         )
 

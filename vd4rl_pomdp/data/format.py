@@ -50,7 +50,7 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
         UserError: frames are not uint8, the disk is full or the folder not writable; no partial file remains.
     """
     if (dtype := np.asarray(rows.get(FRAMES_KEY, np.uint8(0))).dtype) != np.uint8:
-        raise UserError(f"{path}: {FRAMES_KEY} is of {dtype}; frames are of uint8, from 0 to 255")
+        raise UserError(f"{path}: {FRAMES_KEY} is {dtype}; frames must be uint8, from 0 to 255")
     buffer = io.BytesIO()  # in memory: HDF5 cannot close a file on a full disk
     with h5py.File(buffer, "w") as file:
         file.attrs[_ATTRIBUTE] = json.dumps(dict(attributes), sort_keys=True)
@@ -68,7 +68,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
         stored = file.attrs.get(_ATTRIBUTE, "{}")
         attributes = parse_json(stored) if isinstance(stored, str) else None
         if not isinstance(attributes, dict):
-            raise UserError(f"{path}: its attribute {_ATTRIBUTE!r} is no JSON object; {_REPAIR}")
+            raise UserError(f"{path}: its attribute {_ATTRIBUTE!r} is not a JSON object; {_REPAIR}")
         return attributes
 
 
@@ -84,8 +84,8 @@ def read_frame_size(shards: Sequence[Path]) -> int:
     for path, size in zip(shards, sizes, strict=True):
         if size != sizes[0]:
             raise UserError(
-                f"{path}: has frames of {size}x{size} pixels, {shards[0].name} of {sizes[0]}x{sizes[0]}; keep one set "
-                "in a folder"
+                f"{path}: has frames of {size}x{size} pixels, {shards[0].name} of {sizes[0]}x{sizes[0]}; keep one "
+                "dataset per folder"
             )
     return sizes[0]
 
@@ -100,7 +100,7 @@ def _frame_size(path: Path) -> int:
         if frames.dtype != np.uint8 or not square:
             raise UserError(
                 f"{path}: 'observation' is {frames.dtype} of shape {shape}, expected square uint8 frames (N, 3, S, S) "
-                f"of {low} to {high} pixels; convert them, or take another set"
+                f"of {low} to {high} pixels; convert them, or choose another dataset"
             )
         return shape[-1]
 
@@ -165,7 +165,7 @@ def _open(path: Path) -> Iterator[h5py.File]:
     except UserError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError) as error:
-        damaged = UserError(f"{path}: is truncated, damaged or no HDF5 file ({in_one_line(error)}); {_REPAIR}")
+        damaged = UserError(f"{path}: is truncated, damaged or not an HDF5 file ({in_one_line(error)}); {_REPAIR}")
         raise _locked(path, error) or system_error(path, error) or damaged from error
 
 
@@ -194,9 +194,9 @@ def _keys(path: Path, file: h5py.File) -> list[str]:
         if isinstance(stored, h5py.Dataset):
             elsewhere = stored.external is not None or stored.is_virtual
         if elsewhere:
-            raise UserError(f"{path}: {key!r} lies in another file, which is not followed; {_REPAIR}")
+            raise UserError(f"{path}: {key!r} is stored in another file, which is not supported; {_REPAIR}")
         if not isinstance(stored, h5py.Dataset) or stored.shape is None:  # HDF5's null datasets have no shape
-            raise UserError(f"{path}: has no {key!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
+            raise UserError(f"{path}: has no {key!r}, so it is not a V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
     return keys
 
 
@@ -207,7 +207,7 @@ def _check_column(path: Path | str, key: str, value: np.ndarray, count: int) -> 
         raise UserError(f"{path}: {key!r} has shape {value.shape}, expected {expected}; {_REPAIR}")
     if key == "step_type":
         if value.dtype.kind not in "iuf" or not np.isin(value, [int(s) for s in StepType]).all():
-            raise UserError(f"{path}: 'step_type' holds something else than 0, 1 and 2; {_REPAIR}")
+            raise UserError(f"{path}: 'step_type' holds values other than 0, 1 and 2; {_REPAIR}")
         return
     if value.dtype.kind != "f":
         raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")

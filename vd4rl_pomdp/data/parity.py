@@ -85,13 +85,15 @@ def _compare_background(path: Path) -> dict[str, Any]:
     """Compare the median frames of data and environment on the pixels that are static in both."""
     dataset = open_dataset(path)
     if dataset.task is None:
-        raise UserError(f"{path}: cannot tell the task; put the set in a folder named after it, such as walker_walk/")
+        raise UserError(
+            f"{path}: cannot tell the task; put the dataset in a folder named after it, such as walker_walk/"
+        )
     rows = np.linspace(0, dataset.num_rows - 1, min(dataset.num_rows, 400)).astype(int)
     data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task, dataset.frame_size)
     static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)
     if not static.any():
         raise UserError(
-            f"{path}: no pixel is static in both the set and the environment; its frames are not this task's"
+            f"{path}: no pixel is static in both the dataset and the environment; its frames are not this task's"
         )
     result = compare(np.median(ours, 0)[static], np.median(data, 0)[static])
     return {"task": dataset.task, "static_pixels": int(static.sum()), **result}

@@ -55,7 +55,7 @@ class Reference:
                 raise ValueError(f"{made.actor!r} names no actor")
             return made
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{path}: is damaged ({error}); remove it, and the run is compared with no data") from error
+            raise UserError(f"{path}: is damaged ({error}); remove it to compare the run with no data") from error
 
     def with_path_error(self, error: float | None) -> Reference:
         """A copy with the path error of a trained policy."""

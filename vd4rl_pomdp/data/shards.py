@@ -85,13 +85,12 @@ def collect_set(
 def _claim(out: Path, settings: dict[str, Any], stored: dict[str, Any], whole: bool) -> None:
     """Raise UserError unless a folder is empty or holds this data set; an unfinished one must be of the same code."""
     if not stored and holds_anything(out):
-        raise UserError(f"{out}: is not empty and holds no collected set; choose another folder")
+        raise UserError(f"{out}: is not empty and holds no collected dataset; choose another --out")
     if stored and (others := differing(stored, settings)):
-        raise UserError(f"{out}: holds a set collected with another {', '.join(others)}; choose another folder")
+        raise UserError(f"{out}: holds a dataset that differs in {', '.join(others)}; choose another --out")
     if stored and not whole and (parts := of_other_code(stored, settings)):
         raise UserError(
-            f"{out}: was begun before the code of {parts[0]} changed, and is not whole; put that back, or choose "
-            "another folder"
+            f"{out}: is unfinished, and the code of {parts[0]} has changed since; restore it, or choose another --out"
         )
 
 
@@ -103,8 +102,8 @@ def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]
     if stored and before.get("canary") != now.get("canary"):
         drew, here = (told.get("gl_renderer") or "another renderer" for told in (before, now))
         raise UserError(
-            f"{out}: its shards so far were drawn by {drew}, and {here} draws other pixels: go on on a machine like "
-            "the first, or choose another folder"
+            f"{out}: its shards were rendered by {drew}, and {here} renders other pixels: resume on a machine like the "
+            "first, or choose another --out"
         )
     return now
 

@@ -82,7 +82,7 @@ class Store:
 
     def damaged(self, name: str) -> UserError:
         """Error for a cached file that is damaged or was changed."""
-        return UserError(f"{self.folder / name}: is damaged; delete {self.folder} and the set is decoded anew")
+        return UserError(f"{self.folder / name}: is damaged; delete {self.folder} to decode the dataset again")
 
     def physics(self) -> np.ndarray | None:
         """Simulator states (N, P) float64, memory-mapped read-only; None if the data set has none."""

@@ -117,7 +117,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     refuse_inside(out)
     refuse_no_folder(out)
     if holds_anything(out):
-        raise UserError(f"{out}: is not empty; choose another folder to export to")
+        raise UserError(f"{out}: is not empty; choose another --out")
     opened = _resized(read_shards(str(path)), size)
     whole = Path(os.path.abspath(out))  # Minari loses the files of a relative path
     hidden = whole.with_name(f".{whole.name}.export")
@@ -189,14 +189,14 @@ class _Reader:
                 raise UserError("is missing")
             frames, size = rows[FRAMES_KEY], self._source.frame_shape
             if len(frames) < 2:
-                raise UserError("has no step: leave it out of the source")
+                raise UserError("has no step: remove it from the source")
             rows = rows | {"action": self._scaled(rows["action"])}
             if frames.shape[2:] != size:
                 here, there = (f"{height}x{width}" for height, width in (frames.shape[2:], size))
-                raise UserError(f"has pictures of {here} pixels, its set tells of {there}")
+                raise UserError(f"has images of {here} pixels, its dataset declares {there}")
             layout = {key: values.shape[1:] for key, values in rows.items()}
             if frames.dtype != np.uint8 or layout != (self._layout or layout):
-                raise UserError(f"has {frames.dtype} pictures and rows of {layout}, not those of the episodes before")
+                raise UserError(f"has {frames.dtype} images and rows of {layout}, unlike the episodes before")
             self._layout = layout
             others = {key: values for key, values in rows.items() if key != FRAMES_KEY}
             check_rows(f"{self._name}: episode {number}", others, len(frames))
@@ -227,7 +227,7 @@ class _Reader:
         most = float(np.abs(scaled).max())
         if most > 1 + _ROUNDING:
             if not self._clip:
-                told = "its bounds" if low is not None else "[-1, 1], and the source tells no bounds"
+                told = "its bounds" if low is not None else "[-1, 1], and the source has no bounds"
                 raise UserError(
                     f"has actions outside {told} (up to {most:.4g} after scaling); --clip-actions clips them"
                 )
@@ -241,7 +241,7 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
     if size is None:
         if height != width or not low <= height <= high:
             raise UserError(
-                f"has pictures of {height}x{width} pixels, frames are square, of {low} to {high}: pass --size, "
+                f"has images of {height}x{width} pixels, frames must be square, of {low} to {high}: pass --size, "
                 "such as --size 84"
             )
         return source

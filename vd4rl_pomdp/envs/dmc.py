@@ -223,7 +223,7 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
         if "MjModel" not in str(error):
             raise
         raise UserError(
-            f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
+            f"dm-control is incompatible with mujoco {mujoco.__version__} ({error}): install a tested pair, "
             "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
         ) from error
     check_bounds(f"dm_control's {task.domain} {task.task}", env.action_spec().minimum, env.action_spec().maximum)

@@ -66,8 +66,8 @@ class GymnasiumEnv(PixelEnv):
         floating = np.issubdtype(space.dtype, np.floating)
         if not isinstance(space, gymnasium.spaces.Box) or not floating or not space.low.size:
             raise UserError(
-                f"environment {self._name} has the actions {space}: only a bounded Box of floating point can be a "
-                "task; wrap the environment in one that translates them"
+                f"environment {self._name} has the actions {space}, but a task needs a bounded Box of floating "
+                "point: wrap the environment to convert them"
             )
         check_bounds(f"environment {self._name}", space.low, space.high)
         self._space = space
@@ -94,8 +94,8 @@ class GymnasiumEnv(PixelEnv):
         told = self.env.metadata.get("render_fps", 30)
         if not (isinstance(told, _NUMBERS) and 1 <= told <= MOST_STEPS_A_SECOND):
             raise UserError(
-                f"environment {self._name} has the render_fps {told!r} in its metadata: correct it to the steps a "
-                f"second of simulated time, 1 to {MOST_STEPS_A_SECOND}, or give the environment a `dt` in seconds"
+                f"environment {self._name} has the render_fps {told!r} in its metadata: correct it to the steps "
+                f"per second of simulated time, 1 to {MOST_STEPS_A_SECOND}, or give the environment a `dt` in seconds"
             )
         return float(told) / self.task.action_repeat
 
@@ -112,7 +112,7 @@ class GymnasiumEnv(PixelEnv):
         except refusals as error:
             reason = in_one_line(error)
             raise UserError(
-                f"environment {self._name} {what} ({reason}): mend the task's registration, or install what the "
+                f"environment {self._name} {what} ({reason}): correct the task's registration, or install what the "
                 "environment needs"
             ) from error
 
@@ -124,8 +124,8 @@ class GymnasiumEnv(PixelEnv):
             if "'seed'" not in str(error):  # a TypeError from inside the environment
                 raise
             raise UserError(
-                f"environment {self._name} cannot be reset ({in_one_line(error)}): an episode is its seed's, so give "
-                "it Gymnasium's `reset(self, *, seed=None, options=None)`, or wrap it"
+                f"environment {self._name} cannot be reset with a seed ({in_one_line(error)}): give it Gymnasium's "
+                "`reset(self, *, seed=None, options=None)`, or wrap it"
             ) from error
         self._observation, _ = self._of_interface("reset", given, 2)
 
@@ -144,7 +144,7 @@ class GymnasiumEnv(PixelEnv):
         if not isinstance(given, tuple) or len(given) != length:
             found = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
             raise UserError(
-                f"environment {self._name} gives {found} in {method}, where Gymnasium's interface has {length}: wrap it"
+                f"environment {self._name} returns {found} from {method}, expected {length} as in Gymnasium: wrap it"
             )
         return given
 
@@ -154,7 +154,9 @@ class GymnasiumEnv(PixelEnv):
         except (TypeError, ValueError):
             paid = math.nan
         if not math.isfinite(paid):
-            raise UserError(f"environment {self._name} pays {reward}, expected a number: mend its rewards, or wrap it")
+            raise UserError(
+                f"environment {self._name} returns the reward {reward}, expected a number: correct or wrap it"
+            )
         return paid
 
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
@@ -183,8 +185,8 @@ class GymnasiumEnv(PixelEnv):
         if picture.ndim != 3 or picture.shape[-1] not in (1, 3) or picture.dtype != np.uint8 or not picture.size:
             got = f"{picture.dtype} of shape {picture.shape}" if isinstance(shown, np.ndarray) else type(shown).__name__
             raise UserError(
-                f"environment {self._name} shows {got} by its {'render()' if self._renders else 'observation'}, "
-                "expected uint8 pictures (H, W, 3): choose pixels='render' or 'observation' as fits, or wrap it"
+                f"environment {self._name} returns {got} from its {'render()' if self._renders else 'observation'}, "
+                "expected uint8 images (H, W, 3): choose pixels='render' or 'observation', or wrap it"
             )
         return np.repeat(picture, 3, axis=2) if picture.shape[-1] == 1 else picture
 
@@ -194,7 +196,7 @@ class GymnasiumEnv(PixelEnv):
         viewer = getattr(renderer, "viewer", None)  # created at the first render
         if renderer is not None:
             refuse_after_fork()
-        with undisturbed(), self._telling("cannot draw its picture"):
+        with undisturbed(), self._telling("cannot render"):
             if viewer is not None:
                 viewer.make_context_current()
             picture = self.env.render()

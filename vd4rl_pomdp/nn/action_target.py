@@ -114,7 +114,7 @@ def _fit_centers(actions: np.ndarray, codes: int, seed: int) -> np.ndarray:
     """Fit K-means centres, (codes, A) float32, to at most 50,000 of the actions."""
     distinct = len(np.unique(actions, axis=0))
     if distinct < codes:
-        raise UserError(f"the data set has {distinct} distinct actions, fewer than --codes {codes}: lower --codes")
+        raise UserError(f"the dataset has {distinct} distinct actions, fewer than --codes {codes}: lower --codes")
     rng = np.random.default_rng(stream_seed(seed, "kmeans", "sample"))
     sample = actions if len(actions) <= 50_000 else actions[rng.choice(len(actions), 50_000, replace=False)]
     start = stream_seed(seed, "kmeans", "centres") % 2**32  # scikit-learn accepts 32-bit seeds only

@@ -134,7 +134,7 @@ class Encoder(nn.Module):
         if config.history == "none":
             return
         if hasattr(self, config.history):
-            raise UserError(f"memory {config.history!r}: an encoder has something of this name: choose another")
+            raise UserError(f"memory {config.history!r}: an encoder has an attribute of this name: choose another")
         self.add_module(config.history, self.make_memory(self._row_width))
 
     @property
@@ -240,7 +240,7 @@ class Encoder(nn.Module):
         own = (self.config.channels, self.config.size, self.config.size)
         if not self.reads_state and obs.shape[-3:] != own:
             raise UserError(
-                f"this encoder reads observations of shape {own}, and these are of {tuple(obs.shape[-3:])}: use frames "
+                f"this encoder reads observations of shape {own}, not {tuple(obs.shape[-3:])}: use frames "
                 "of its size and stack, or pretrain an encoder on these"
             )
 

@@ -102,13 +102,13 @@ def load_encoder(
     if action_dim is not None and encoder_config.action_dim != action_dim:
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
-            f"the data set has {action_dim}; pretrain one on this task"
+            f"the dataset has {action_dim}; pretrain one on this task"
         )
     trained = encoder_config.size
     if size is not None and encoder_config.frame_encoder != STATE and trained != size:
         raise UserError(
-            f"{folder}: this encoder reads pictures of {trained}x{trained} pixels, the data set has {size}x{size}; "
-            "pretrain one on this set"
+            f"{folder}: this encoder reads images of {trained}x{trained} pixels, the dataset has {size}x{size}; "
+            "pretrain one on this dataset"
         )
     if task is not None and card.task != task:
         raise UserError(
@@ -120,14 +120,14 @@ def load_encoder(
         CorruptionConfig.of(**card.corruption).check()
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(
-            f"{folder}/config.json: names no encoder ({first_line(error)}); mend that, or pretrain it again"
+            f"{folder}/config.json: describes no encoder ({first_line(error)}); correct it, or pretrain it again"
         ) from error
     try:
         encoder.load_state_dict(read_tensors(folder / WEIGHTS))
     except RuntimeError as error:
         raise UserError(
             f"{folder}/model.safetensors: does not fit the network that config.json beside it names, whose code may "
-            f"have changed ({in_one_line(error)}); take the code it was pretrained with, or pretrain the encoder again"
+            f"have changed ({in_one_line(error)}); use the code it was pretrained with, or pretrain the encoder again"
         ) from error
     except (FileNotFoundError, SafetensorError) as error:
         reason = first_line(error)

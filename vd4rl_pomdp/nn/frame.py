@@ -169,7 +169,7 @@ def _mixer(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """MLP-Mixer of 8 layers on patches of 10x10 pixels (the paper's navigation encoder)."""
     if size % _PATCH:
         raise UserError(
-            f"frame encoder 'mixer' cuts pictures into patches of {_PATCH} pixels, and {size} is no multiple of it: "
+            f"frame encoder 'mixer' cuts images into patches of {_PATCH} pixels, and {size} is not a multiple: "
             "choose another --frame-encoder"
         )
     layers = [MixerLayer((size // _PATCH) ** 2, _MIXER_DIM) for _ in range(_MIXER_LAYERS)]
@@ -208,7 +208,7 @@ STATE = "state"
 def _refuse_part(name: str, part: FrameEncoderPart) -> None:
     """Raise UserError for a frame encoder with a reserved name or invalid options."""
     if name == STATE:
-        raise UserError("encoders of simulator states have this name: choose another")
+        raise UserError("this name is reserved for simulator states: choose another")
     refuse_options(part.options, FrameOptions)
 
 
@@ -329,12 +329,12 @@ def make_frame_encoder(name: str, channels: int, size: int, settings: Mapping[st
         encoder = FrameEncoder(maps, channels, size, options.feature_dim)
     except RuntimeError as error:
         raise UserError(
-            f"frame encoder {name!r} cannot read pictures of {size}x{size} pixels ({first_line(error)}): choose "
-            "another --frame-encoder, or a set of larger frames"
+            f"frame encoder {name!r} cannot read images of {size}x{size} pixels ({first_line(error)}): choose "
+            "another --frame-encoder, or a dataset of larger frames"
         ) from error
     if len(encoder.map_shape) != 3:
         raise UserError(
-            f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N pictures, not maps (N, C', H', W'): "
+            f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N images, not maps (N, C', H', W'): "
             "give its module's output height and width, 1 for none"
         )
     for parameter in encoder.parameters():

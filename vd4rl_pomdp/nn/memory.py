@@ -55,7 +55,7 @@ class MemoryPart:
 def _refuse_part(name: str, part: MemoryPart) -> None:
     """Raise UserError for a memory with a reserved name or invalid options."""
     if name in ("none", "method"):
-        raise UserError("--history has this word for something else: choose another name")
+        raise UserError("this name is reserved: choose another")
     refuse_options(part.options, MemoryOptions)
 
 

@@ -42,7 +42,7 @@ class Pretrained(nn.Module):
         """
         super().__init__()
         if channels % 3:
-            raise UserError(f"--frame-encoder pretrained reads frames of 3 channels, and {channels} are no frames")
+            raise UserError(f"--frame-encoder pretrained needs frames of 3 channels, not {channels}")
         model = _load(name)
         found = _content(model)
         if weights not in ("", found):

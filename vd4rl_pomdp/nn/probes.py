@@ -19,7 +19,7 @@ def held_out(episode: np.ndarray) -> np.ndarray:
     """Test rows (N,) bool, given each row's episode (N,); UserError if there is only one episode."""
     episode = np.unique(episode, return_inverse=True)[1]
     if episode.max() == 0:
-        raise UserError("a probe fits some episodes and is tested on others: one alone is too few")
+        raise UserError("a probe needs at least two episodes, one to fit and one to test")
     return episode % HELD_OUT == HELD_OUT - 1 if episode.max() >= HELD_OUT - 1 else episode == episode.max()
 
 

@@ -196,9 +196,9 @@ def _check_weights(path: Path, actor: Actor, task: str | None) -> None:
         finite = all(np.isfinite(value).all() for value in actor.weights.values())
         action = actor.act(np.zeros(widths.state_dim, np.float32), np.random.default_rng(0)) if finite else None
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path}: its weights form no actor of {name} ({error}); {_REMEDY}") from error
+        raise UserError(f"{path}: its weights do not fit an actor of {name} ({error}); {_REMEDY}") from error
     if action is None or action.shape != (widths.action_dim,):
-        raise UserError(f"{path}: its weights form no actor of {name}; {_REMEDY}")
+        raise UserError(f"{path}: its weights do not fit an actor of {name}; {_REMEDY}")
 
 
 def load_actor(task: str, quality: str) -> Actor:

@@ -70,7 +70,7 @@ class ViewConfig(StageConfig):
         refuse_inside(self.out)
         refuse_no_folder(self.out.parent)
         if os.path.lexists(self.out) and not (self.out.exists() and _MARK in read_bytes(self.out)[:1000]):
-            raise UserError(f"{self.out}: is no page of `data view`; choose another --out")
+            raise UserError(f"{self.out}: is not a page of `data view`; choose another --out")
 
 
 def write_view(config: ViewConfig) -> Path:

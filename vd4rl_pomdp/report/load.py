@@ -271,7 +271,7 @@ def _load(result: Result) -> Run:
             "finetune_seconds": result.files["timing"]["seconds"] if result.finished else None,
         }
         if wrong := [value for value in told.values() if value is not None and not isinstance(value, int | float)]:
-            raise TypeError(f"{wrong[0]!r} is no number")
+            raise TypeError(f"{wrong[0]!r} is not a number")
         reference = Reference() if stored is None else Reference.parse(result.path / REFERENCE_FILE, stored)
         return Run(result, result.labels, read_settings(result.record, result.card), reference, told)
 

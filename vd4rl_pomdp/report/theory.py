@@ -45,8 +45,8 @@ def load_section(paths: list[Path]) -> str | None:
             return section(study)
         except (LookupError, TypeError, ValueError, AttributeError, UndefinedError) as error:
             raise UserError(
-                f"{file}: is no whole study ({type(error).__name__}: {error}); write it again: vd4rl-pomdp theory "
-                f"--out {file.parent}"
+                f"{file}: is not a complete study ({type(error).__name__}: {error}); write it again: vd4rl-pomdp "
+                f"theory --out {file.parent}"
             ) from error
     return None
 

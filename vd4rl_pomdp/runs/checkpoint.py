@@ -75,7 +75,7 @@ class Checkpoints:
             return float(found["seconds"])
         for path, problem in damaged.items():
             raise UserError(
-                f"{path}: this checkpoint is damaged ({problem}), and there is no whole one; remove {self._folder} to "
+                f"{path}: this checkpoint is damaged ({problem}), and no other is complete; remove {self._folder} to "
                 "start the run again"
             )
         return None
@@ -123,7 +123,7 @@ def _copied(node: Any, place: str) -> Any:
         return [_copied(value, f"{place}/{i}") for i, value in enumerate(node)]
     if type(node) not in (type(None), bool, int, float, str):
         raise UserError(
-            f"a checkpoint cannot keep {place[1:]}, which is a {type(node).__name__}: give a tensor, a number of "
-            "Python's, a word, None, or lists and dicts of them"
+            f"a checkpoint cannot store {place[1:]}, which is a {type(node).__name__}: use a tensor, a Python number, "
+            "a string, None, or lists and dicts of them"
         )
     return node

@@ -55,7 +55,9 @@ class Means:
             UserError: a scalar's name is reserved.
         """
         if taken := [name for name in logs if name == "step" or name.startswith(EVALUATION)]:
-            raise UserError(f"a scalar of the loss is called {taken[0]!r}, as something else is in {METRICS_FILE}")
+            raise UserError(
+                f"a scalar of the loss is called {taken[0]!r}, which {METRICS_FILE} uses already: rename it"
+            )
         if logs:
             device = next(iter(logs.values())).device
             values = [value.detach().float().reshape(()).to(device) for value in logs.values()]

@@ -176,7 +176,7 @@ def read_run(folder: Path | str) -> Result:
     folder = Path(folder)
     files = read_records(folder).files
     if "config" not in files:
-        raise UserError(f"{folder}: is no run, which has a {CONFIG_FILE}; name a folder that a training wrote")
+        raise UserError(f"{folder}: is not a run (no {CONFIG_FILE}); name a folder that a training wrote")
     metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
     # a truncated last row is dropped only from unfinished runs
     found = read_episodes(path) if "timing" in files else episodes_until(path, sys.maxsize)
@@ -193,7 +193,7 @@ def read_run(folder: Path | str) -> Result:
             what = f"{played} of {episodes} episodes of the last evaluation"
             raise UserError(f"{path}: has {what}; {remedy(folder)}")
         if files.get("critic") == {} and any(VALUE in row for row in metrics):
-            raise UserError(f"{folder / CRITIC_FILE}: tells of no critic, {METRICS_FILE} of one; {remedy(folder)}")
+            raise UserError(f"{folder / CRITIC_FILE}: has no critic, {METRICS_FILE} has one; {remedy(folder)}")
         files["labels"] = files.get("labels", {}) | _labels(run)
         return replace(run, id=_id(run))
 
@@ -221,7 +221,7 @@ def _id(run: Result) -> str:
 def _check(run: Result) -> None:
     """Check the types of a run's essential parts; raises KeyError, TypeError or AttributeError."""
     if not all(isinstance(part, dict) for part in (*run.files.values(), *run.parts, run.record["config"], run.encoder)):
-        raise TypeError("a part of it is no JSON object")
+        raise TypeError("a part of it is not a JSON object")
     if "seed" not in run.record["config"]:
         raise TypeError("its record holds no settings")
     if not isinstance(run.record["stage"], str):
@@ -238,9 +238,9 @@ def read_results(folder: Path | str) -> list[Result]:
     try:  # before the rows: they are written first, so a concurrent write cannot make rows look missing
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
-        raise UserError(f"{path.parent}: holds no {RUNS}, so it is no results folder") from error
+        raise UserError(f"{path.parent}: holds no {RUNS}, so it is not a results folder") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
+        raise UserError(f"{path}: is not UTF-8 ({error}); take another copy") from error
     if not lines:
         raise UserError(f"{path}: is empty; take another copy, or remove it")
     for row in read_episodes(folder / EPISODES_FILE):

@@ -115,12 +115,14 @@ class RunFolder:
         differing = sorted(k for k in self.config.keys() - RUNTIME_FIELDS if config.get(k) != self.config[k])
         if stored["stage"] != self.stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
-            raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
+            raise UserError(
+                f"{self.path}: holds a run with a different config ({what}); choose another --out or remove it"
+            )
         for name, now in self.inputs.items():
             if inputs.get(name) != now:
                 raise UserError(
                     f"{self.path}: holds a run with other content of --{name} ({self.config.get(name)} was "
-                    f"{inputs.get(name)} and is {now}); give it what it began with, or choose another --out"
+                    f"{inputs.get(name)} and is {now}); restore what it began with, or choose another --out"
                 )
         lost = next((name for name in self._results if self.finished and not (self.path / name).exists()), None)
         if lost:
@@ -188,7 +190,7 @@ class RunFolder:
         # The run would start over and append the same evaluations again.
         if seconds is None and read_episodes(self.path / EPISODES_FILE):
             raise UserError(
-                f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: put them back, "
+                f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: restore them, "
                 "or remove the folder to start the run again"
             )
         self._before = seconds or 0.0

@@ -107,7 +107,7 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
         if error.__cause__ is not None:  # a result that cannot be unpickled here
             raise
         raise WorkerDiedError(
-            "a worker process ended before its job: if it printed nothing, it was killed, perhaps for want of memory: "
+            "a worker process ended before its job: if it printed nothing, it was killed, perhaps for lack of memory: "
             "use fewer --workers and re-run the same command"
         ) from None
     finally:

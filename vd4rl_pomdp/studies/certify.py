@@ -77,12 +77,12 @@ def planned(
     check_cells(cells, GRID)
     if not returns:
         if any(change.startswith("finetune.") for change in changes):
-            raise UserError("--change finetune.* is of policies, which are trained with --returns: add it")
+            raise UserError("--change finetune.* is for policies, which are trained with --returns: add it")
         without = [replace(c, sections={n: s for n, s in c.sections.items() if n != "finetune"}) for c in cells]
         cells = [cell for cell in without if cell.value("method") != STATE]
     jobs = [job for cell in cells for job in _jobs(cell, data, out)]
     if len({job.name for job in jobs}) < len(jobs):
-        raise UserError("--change lists several values of a setting: a certificate is of one, but for seeds")
+        raise UserError("--change lists several values of a setting: only seed may have several")
     return dataset, cells, jobs
 
 

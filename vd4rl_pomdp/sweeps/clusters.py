@@ -50,7 +50,9 @@ class ClusterTask:
         try:
             os.chdir(self.cwd)
         except OSError as error:
-            raise UserError(f"{self.cwd}: not on node {socket.gethostname()}; use a disk that all share") from error
+            raise UserError(
+                f"{self.cwd}: not on node {socket.gethostname()}; use a disk that all nodes share"
+            ) from error
         with interrupt.handled():
             # submitit would resubmit the task on SIGUSR2; here `watch` decides that.
             signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
@@ -95,7 +97,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                 if wanted > 0:
                     vain += not live  # queued tasks may wait for days: no failure
                     if vain > VAIN:
-                        raise UserError(f"tasks end before they begin a job: see {cluster.folder}")
+                        raise UserError(f"tasks end before they start a job: see {cluster.folder}")
                     with interrupt.deferred():  # an interrupted submission could not be cancelled
                         cluster.submit(task, wanted)
                 heard = True
@@ -148,7 +150,9 @@ class SlurmCluster:
                 self._executor.submit_array([task] * number)
         except RuntimeError as error:  # how submitit reports a failed command
             lines = str(error).strip().splitlines()
-            raise UserError(f"Slurm took no array ({lines[-1] if lines else 'it does not say why'})") from error
+            raise UserError(
+                f"Slurm rejected the job array ({lines[-1] if lines else 'it does not say why'})"
+            ) from error
 
     def stop(self) -> None:
         """Cancel pending tasks, signal the running ones to checkpoint and exit, and wait for them."""

@@ -109,7 +109,7 @@ class SweepFolder:
         for plan in plans:
             if (plan.made_in / plan.out).resolve() != self.out.resolve():
                 raise UserError(
-                    f"{self.out}: was planned as {plan.made_in / plan.out}: move it back, or plan it anew by `sweep "
+                    f"{self.out}: was planned as {plan.made_in / plan.out}: move it back, or plan it again with `sweep "
                     f"run GRID --out {self.out}`"
                 )
         return plans

@@ -162,7 +162,7 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
         tables = {name: told.pop(name, []) for name in ("block", "where")}
         for kind, found in tables.items():
             if not isinstance(found, list):
-                raise UserError(f"its {kind}s are no list of tables: write [[{kind}]]")
+                raise UserError(f"its {kind}s are not a list of tables: write [[{kind}]]")
         blocks, common = [_sections(block) for block in tables["block"] or [{}]], _sections(told)
         last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
         whole = [_merge(common, block) for block in blocks]
@@ -198,16 +198,16 @@ def _read(path: Path, name: str) -> Values:
     except (UserError, Terminated):
         raise
     except (Exception, SystemExit) as error:  # a Python file may raise anything
-        raise UserError(f"{path}: is no grid ({type(error).__name__}: {error}); mend it") from error
+        raise UserError(f"{path}: is not a valid grid ({type(error).__name__}: {error}); correct it") from error
     if not isinstance(told, dict):
-        raise UserError(f"{path}: defines no dict called GRID; see the grids that ship for its form")
+        raise UserError(f"{path}: defines no dict called GRID; see the shipped grids for examples")
     return dict(told)
 
 
 def _sections(table: Any) -> Sections:
     """Settings by section, from one table of a grid's file."""
     if not isinstance(table, dict):
-        raise UserError(f"{table!r} is no table of settings")
+        raise UserError(f"{table!r} is not a table of settings")
     sections: Sections = {"": {}}
     for name, value in table.items():
         if name in SHARED:
@@ -215,7 +215,7 @@ def _sections(table: Any) -> Sections:
         elif name not in SECTIONS:
             raise UserError(f"unknown section or setting {name!r}: choose one of {', '.join((*SHARED, *SECTIONS))}")
         elif not isinstance(value, dict):
-            raise UserError(f"{name} is no table of settings")
+            raise UserError(f"{name} is not a table of settings")
         else:
             sections[name] = dict(value)
     return sections
@@ -244,9 +244,9 @@ def _change(text: str) -> Sections:
     where, equals, value = (part.strip() for part in text.partition("="))
     section, _, name = where.rpartition(".")
     if not equals or not name:
-        raise UserError(f"{text!r} is no change: write section.name=value, such as pretrain.steps=100 or seed=0,1")
+        raise UserError(f"{text!r} is not a change: write section.name=value, such as pretrain.steps=100 or seed=0,1")
     if name not in SHARED if not section else section not in SECTIONS:
-        raise UserError(f"{where!r} is no setting of a grid: write one of {', '.join(SHARED)}, or SECTION.NAME")
+        raise UserError(f"{where!r} is not a grid setting: write one of {', '.join(SHARED)}, or SECTION.NAME")
     values = [_toml_value(part.strip()) for part in value.split(",")]
     return {section: {name: values if len(values) > 1 else values[0]}}
 
@@ -256,10 +256,10 @@ def _check_block(block: Sections) -> None:
     if not chain or (set(chain) & set(PIXELS) and set(chain) & set(MAZES)):
         raise UserError(f"a block needs sections of {', '.join(PIXELS)}, or of {', '.join(MAZES)}")
     if "finetune" in chain and "pretrain" not in chain:
-        raise UserError("a block with finetune needs pretrain, whose encoder it takes")
+        raise UserError("a block with finetune needs pretrain, which makes its encoder")
     if chain[0] not in ("collect", "navigation_collect"):
         kind = "navigation_collect" if chain[0] in MAZES else "collect"
-        raise UserError(f"a block trains on no set: add a section {kind}")
+        raise UserError(f"a block has no dataset: add a section {kind}")
     for section, settings in block.items():
         _check_settings(section, settings)
 
@@ -268,13 +268,13 @@ def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
     for name, value in settings.items():
         where = f"{section}.{name}".lstrip(".")
         if not isinstance(name, str) or not name.isidentifier() or name == "help":
-            raise UserError(f"{where}: is no setting of a stage; they are called like max_k, with underscores")
+            raise UserError(f"{where}: is not a stage setting; names have underscores, as in max_k")
         if name in _FOLDERS:
-            raise UserError(f"{where}: a sweep names its folders itself: leave it out, and give --out, --data")
+            raise UserError(f"{where}: sweeps name their folders: leave it out, and pass --out and --data")
         if section in _TRAININGS and name == "seed":
             raise UserError(f"{where}: a cell's trainings share one seed: write it outside the sections")
         if isinstance(value, list) and axes and name in RUNTIME_FIELDS:
-            raise UserError(f"{where}: changes no result, so that cells of several would be one run; tell one")
+            raise UserError(f"{where}: does not change results, so cells cannot differ in it; give one value")
         values = value if isinstance(value, list) and axes else [value]
         kinds = {int} if name == "seed" else {str, int, float, bool}
         if not values or not {type(one) for one in values} <= kinds:
@@ -320,7 +320,7 @@ def _condition(text: str) -> tuple[str, list[str]]:
     """Parse a condition into name and values: "method=mik+a,acro" -> ("method", ["mik+a", "acro"])."""
     name, equals, values = (part.strip() for part in text.partition("="))
     if not (name and equals):
-        raise UserError(f"{text!r} is no condition: write name=value, or name=value,value")
+        raise UserError(f"{text!r} is not a condition: write name=value, or name=value,value")
     return name, [_in_words(_toml_value(value.strip())) for value in values.split(",")]
 
 

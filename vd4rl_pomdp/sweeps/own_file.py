@@ -39,6 +39,6 @@ def refuse_unknown_to_jobs(settings: Mapping[str, str]) -> None:
         for part, origin in code_of(settings)["plugins"].items():
             if origin == BY_CALL:
                 raise UserError(
-                    f"{part}: was registered in this process alone, and jobs have processes of their own: register it "
-                    "in a file that ends in `main()`, and start the sweep by `python FILE sweep run`"
+                    f"{part}: is registered only in this process, but each job is a process of its own: register it in "
+                    "a file that ends in `main()`, and start the sweep with `python FILE sweep run`"
                 )

@@ -82,19 +82,21 @@ class DataSet:
             wanted = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
             for has, asked in zip((task, read_frame_size(shards)), wanted, strict=True):
                 if has not in (None, asked):
-                    what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
+                    what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a dataset of {has}"
                     raise UserError(f"{self.folder}: holds {what}, the grid says {asked}; choose another --data")
         elif (self.folder / PLAN).exists():
             stored = read_json(self.folder / PLAN)
             for name in differing(stored, self.wanted)[:1]:
                 both = (values.get(name) for values in (stored, self.wanted))
                 has, asked = (f"the default {name}" if v is None else f"{name} {v}" for v in both)
-                raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
+                raise UserError(
+                    f"{self.folder}: holds a dataset of {has}, the grid says {asked}; choose another --data"
+                )
         elif self.section == "collect":
             TASKS.named(self.wanted["task"])
             if self.wanted["quality"] not in SET_QUALITIES:
                 raise UserError(
-                    f"{self.folder}: holds no set, and the quality {self.wanted['quality']!r} cannot be collected: "
+                    f"{self.folder}: holds no dataset, and the quality {self.wanted['quality']!r} cannot be collected: "
                     f"put the set there, or choose one of {', '.join(SET_QUALITIES)}"
                 )
 

@@ -87,7 +87,7 @@ def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict
     algorithm.step = watching  # type: ignore[method-assign]
     logs = algorithm.update(given)
     del algorithm.step
-    claim(steps, "an update steps along no loss")
+    claim(steps, "an update makes no optimiser step")
     return steps, logs
 
 
@@ -143,7 +143,7 @@ def a_loss_moves_what_its_optimiser_steps(name: str, **options: Any) -> None:
             ids = {id(p) for p in stepped}
             modules = _modules(algorithm)
             mine = {f"/{part}/{key}" for part, m in modules.items() for key, p in m.named_parameters() if id(p) in ids}
-            claim(len(mine) == len(stepped), f"of {len(stepped)} parameters that it steps parts() names {len(mine)}")
+            claim(len(mine) == len(stepped), f"parts() names {len(mine)} of its optimiser's {len(stepped)} parameters")
             reached = zip(stepped, step.reached[:-1], strict=True)
             missed = [tuple(p.shape) for p, gradient in reached if gradient is None or not gradient.any()]
             claim(missed == [], f"a loss has no gradient to parameters of the shapes {missed}")
@@ -151,7 +151,7 @@ def a_loss_moves_what_its_optimiser_steps(name: str, **options: Any) -> None:
             claim(changed == mine, f"the step moved {shown(changed)}, its optimiser has {shown(mine)}")
             policy_moved |= {key for key in changed if key.startswith("/policy/")}
     still = {f"/policy/net.{key}" for key in algorithm.policy.net.state_dict()} ^ policy_moved
-    claim(not still, f"within {UPDATES} updates of the policy these alone stood still, or should have: {shown(still)}")
+    claim(not still, f"after {UPDATES} updates, these were not trained, or should not have been: {shown(still)}")
 
 
 def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) -> None:
@@ -190,7 +190,7 @@ def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) ->
             tau = getattr(algorithm, "tau")  # noqa: B009 (algorithms without targets have none)
             claim_close(after[key], before[key].lerp(online, tau), f"{key} did not move by tau = {tau}")
         crept |= {key.split("/")[1] for key in by_itself}
-    claim(crept == targets.keys(), f"of the targets {shown(targets)} moved {shown(crept)}")
+    claim(crept == targets.keys(), f"the targets are {shown(targets)}, but {shown(crept)} moved")
 
 
 def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **options: Any) -> None:
@@ -280,7 +280,7 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
         whole.settle(seed)
         found = course(run, [{key: value[seed] for key, value in row.items()} for row in logs])
         far = farther_than_rounding(found, single)
-        claim(not far, f"a stacked run is not what it is alone: {shown(far)}")
+        claim(not far, f"a stacked run differs from a single one: {shown(far)}")
 
 
 def actions_lie_within_their_bounds(name: str, **options: Any) -> None:

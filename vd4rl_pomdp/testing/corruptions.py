@@ -78,9 +78,9 @@ def equal_keys_give_equal_masks(name: str, **options: Any) -> None:
     obs, key, corruption = stacks(), torch.arange(100, 100 + STACKS), _make(name, options)
     whole = corruption(obs, key)
     alone = torch.cat([corruption(obs[i : i + 1], key[i : i + 1]) for i in range(STACKS)])
-    claim(torch.equal(whole, alone), "stacks look otherwise in a batch than alone")
+    claim(torch.equal(whole, alone), "a stack looks different in a batch than alone")
     windows = corruption(obs.view(2, STACKS // 2, *obs.shape[1:]), key.view(2, -1))
-    claim(torch.equal(windows.view_as(whole), whole), "stacks look otherwise in windows than in a batch")
+    claim(torch.equal(windows.view_as(whole), whole), "a stack looks different in windows than in a batch")
 
 
 def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
@@ -106,7 +106,7 @@ def frames_that_are_dropped_stay_dropped(name: str, **options: Any) -> None:
     claim(not _frames(out)[dropped].any(), "a dropped frame is not black")
     other = obs.clone()
     _frames(other)[dropped] = 7
-    claim(torch.equal(corruption(other, key), out), "the frames that stay show what a dropped one held")
+    claim(torch.equal(corruption(other, key), out), "the kept frames depend on a dropped one")
 
 
 def _frames(obs: Tensor) -> Tensor:
@@ -118,7 +118,7 @@ def emission_never_changes_a_row(name: str, **options: Any) -> None:
     """Runs with equal seeds see equal masks; under `emission` a row always has the same mask."""
     row = torch.arange(STACKS)
     always = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 0)
-    claim(torch.equal(always(stacks(), row), always(stacks(), row)), "a row looked otherwise when it came again")
+    claim(torch.equal(always(stacks(), row), always(stacks(), row)), "a row looked different the second time")
     one, other = (BatchCorruption(CorruptionConfig.of(name, "resample", **options), 3) for _ in range(2))
     for _ in range(2):
         claim(torch.equal(one(stacks(), row), other(stacks(), row)), "two runs with one seed saw different masks")
@@ -131,7 +131,7 @@ def the_environment_shows_what_the_data_show(name: str, **options: Any) -> None:
     environment, seed = _make(name, options), stream_seed(7, "corruption", "emission")
     for i, (seen, row) in enumerate(zip(stacks(4), rows, strict=True)):
         now = environment(seen[None], derive_keys(seed, row[None]))[0]
-        claim(torch.equal(now, data[i]), "a row looks otherwise in the environment")
+        claim(torch.equal(now, data[i]), "a row looks different in the environment")
 
 
 def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> None:
@@ -157,7 +157,7 @@ def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
     painted = again.corruption.paint(dataset.frames, index, keys, key, shift)
     if painted is not None:
         same = torch.equal(painted.view_as(expected), expected)
-        claim(same, "a GPU would hide other pixels: what `hides` tells is not what the stage does to frames")
+        claim(same, "a GPU would hide other pixels: `hides` does not match what the stage does to frames")
 
 
 def _random_set(folder: Path) -> Dataset:

@@ -62,7 +62,7 @@ def features_have_one_shape(name: str, **options: Any) -> None:
         claim((tuple(given.shape), given.dtype) == (shape, torch.float32), f"{tuple(given.shape)} {given.dtype}")
         claim(given.isfinite().all(), "some are not finite")
     claim_close(windows.flatten(0, 1), flat, "windows give other features than a batch", 1e-5)
-    claim_close(floats, flat, "float pictures give other features than uint8", 1e-5)
+    claim_close(floats, flat, "float images give other features than uint8", 1e-5)
 
 
 def pictures_are_not_mixed(name: str, **options: Any) -> None:
@@ -74,7 +74,7 @@ def pictures_are_not_mixed(name: str, **options: Any) -> None:
         weights = torch.randn(features.shape[-1], generator=torch.Generator().manual_seed(0))
         (gradient,) = torch.autograd.grad((features[1] * weights).sum(), obs)
         reached = gradient.flatten(1).abs().amax(1) > 0
-        claim(reached.tolist() == [False, True, False], f"features of picture 1 have gradients to {reached.tolist()}")
+        claim(reached.tolist() == [False, True, False], f"features of image 1 have gradients to {reached.tolist()}")
 
 
 def gradients_reach_all_parameters(name: str, **options: Any) -> None:

@@ -217,7 +217,7 @@ def optional_terms_are_added(name: str, **settings: Any) -> None:
     plain.load_state_dict({key: state[key] for key in plain.state_dict()})
     loss, logs = rich.loss(batch(), 0.25)
     expected = plain.loss(batch(), 0.25)[0] + 0.5 * logs["self_prediction"] + 0.1 * 0.75 * logs["l2_states"]
-    claim_close(loss.detach(), expected.detach(), "the loss with them is not the loss without, and they")
+    claim_close(loss.detach(), expected.detach(), "the loss with these terms is not the loss without, plus the terms")
     claim(rich.head.k is None, "--no-k-embedding leaves k in the head")
     told = cast(InverseObjective, build(name, **(settings | {"k_embedding": True})))
     claim(told.head.k is not None, "--k-embedding gives the head no k")

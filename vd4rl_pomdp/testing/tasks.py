@@ -42,7 +42,7 @@ def play(env: PixelEnv, seed: int) -> tuple[list[TimeStep], np.ndarray]:
     rows: list[TimeStep] = [env.reset(seed)]
     actions: list[np.ndarray] = []
     while not rows[-1].last:
-        claim(len(actions) < DECISIONS, f"an episode of {DECISIONS} decisions goes on")
+        claim(len(actions) < DECISIONS, f"an episode of {DECISIONS} decisions does not end")
         actions.append(rng.uniform(-1, 1, env.action_dim).astype(np.float32))
         rows.append(env.step(actions[-1]))
     return rows, np.stack(actions)
@@ -57,8 +57,8 @@ def episodes_repeat_from_their_seeds(name: str) -> None:
         claim(len(again) == len(first), f"it had {len(first)} rows and has {len(again)}")
         for t, (one, other) in enumerate(zip(first, again, strict=True)):
             same = (np.array_equal(getattr(one, part), getattr(other, part)) for part in ("frame", "state", "physics"))
-            claim(all(same), f"row {t} shows another picture or state: draw from the seed that reset is given")
-            claim(one.reward == other.reward, f"row {t} pays {one.reward} and {other.reward}")
+            claim(all(same), f"row {t} differs in frame or state: draw from the seed passed to reset")
+            claim(one.reward == other.reward, f"row {t} has the rewards {one.reward} and {other.reward}")
 
 
 def frames_have_the_size_asked_for(name: str) -> None:
@@ -87,10 +87,10 @@ def rows_have_the_declared_widths(name: str) -> None:
     claim(layout_of(task) == found, f"its layout says {task.layout}, the environment has {found}")
     rows, actions = play(make(name), 0)
     claim(actions.shape[1] == found.action_dim, f"{actions.shape[1]} action dimensions, not {found.action_dim}")
-    claim(rows[0].reward == 0, f"the first row pays {rows[0].reward}")
+    claim(rows[0].reward == 0, f"the first row has the reward {rows[0].reward}")
     width = rows[0].physics.size
     for row in rows:
-        claim(row.frame is None, "a frame is drawn that was not asked for")
+        claim(row.frame is None, "a frame is rendered that was not requested")
         claim(
             (row.state.shape, row.state.dtype) == ((found.state_dim,), np.float32),
             f"a state is {row.state!r}",
@@ -107,7 +107,7 @@ def episodes_end_once(name: str) -> None:
     claim(kinds == [StepType.FIRST, *middle, StepType.LAST], f"they are {[kind.name for kind in kinds]}")
     claim(all(row.discount == 1 for row in rows[:-1]), "a row before the last has another discount than 1")
     claim(rows[-1].discount in (0, 1), f"the last row has the discount {rows[-1].discount}")
-    claim(rows[-1].terminated == (rows[-1].discount == 0), "it is told otherwise whether the task ended the episode")
+    claim(rows[-1].terminated == (rows[-1].discount == 0), "`terminated` contradicts the discount")
     limited, _ = play(make(name, length=1), 0)
     claim(len(limited) == 2 and limited[1].last, "a limit of one decision does not end an episode")
 
@@ -153,7 +153,7 @@ def rewards_replay(name: str) -> None:
     for seed in (3, 4):  # the second episode starts in a used simulator
         rows, actions = play(env, seed)
         found, paid = replay_rewards(name, rows[0].physics, actions), [row.reward for row in rows[1:]]
-        claim(np.array_equal(found, paid), f"{paid} were paid, {found.tolist()} are replayed")
+        claim(np.array_equal(found, paid), f"the rewards were {paid} and replay as {found.tolist()}")
 
 
 CHECKS: tuple[Check, ...] = (

@@ -153,7 +153,7 @@ def test_an_episode_is_replayed_to_the_digit_and_a_difference_names_what_drew_an
     add_results([tmp_path / "other"], tmp_path / "without")
     with pytest.raises(SystemExit):
         main(["results", "verify", str(tmp_path / "without"), "--replay", str(run)])
-    assert "has no row there; name the folder of one that has" in capsys.readouterr().err
+    assert "has no rows in the results folder; name a run that has" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("critic", [{"value": "much"}, {"moved": True}, {"moved": float("nan")}, {"valu": 1.0}, [1.0]])
@@ -174,5 +174,5 @@ def test_an_empty_critic_is_refused_beside_a_critics_metrics_and_counts_for_noth
     assert load_runs([run])[0].converged is None
     with (run / "metrics.jsonl").open("a") as file:
         file.write(json.dumps({"step": 10, "q": 150.0}) + "\n")
-    with pytest.raises(UserError, match=r"critic\.json: tells of no critic, metrics\.jsonl of one; put it back"):
+    with pytest.raises(UserError, match=r"critic\.json: has no critic, metrics\.jsonl has one; put it back"):
         add_results([run], tmp_path / "results")

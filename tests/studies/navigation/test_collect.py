@@ -126,7 +126,7 @@ def test_wrong_settings_are_named(changes, message, tmp_path):
 
 
 def test_another_collection_is_refused(maze_set):
-    with pytest.raises(UserError, match="collected with another seed"):
+    with pytest.raises(UserError, match="dataset that differs in seed"):
         collect(small(maze_set, seed=2))
 
 

@@ -150,7 +150,7 @@ def test_every_first_person_maze_is_driven_by_an_actor_of_its_kinematics():
 
 
 def test_a_maze_that_a_planner_drives_through_trains_no_actor(tmp_path):
-    with pytest.raises(UserError, match="--maze is no_curtain, which a planner drives through"):
+    with pytest.raises(UserError, match="--maze is no_curtain, where a planner drives"):
         train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", maze="no_curtain"))
 
 
@@ -173,6 +173,6 @@ def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
 def test_a_policy_replaces_nothing(tmp_path, kind):
     out = tmp_path / "actor.safetensors"
     out.write_text("mine\n") if kind == "file" else out.symlink_to("nothing")
-    with pytest.raises(UserError, match=r"actor\.safetensors: is there already"):
+    with pytest.raises(UserError, match=r"actor\.safetensors: exists already"):
         train_first_person(FirstPersonConfig(out, decisions=1))
     assert kind != "file" or out.read_text() == "mine\n"

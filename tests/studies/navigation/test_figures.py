@@ -51,7 +51,7 @@ def test_the_film_shows_the_mass_through_curtains_and_the_estimate_as_a_ring(tmp
 
 def test_a_file_that_is_no_trajectory_is_named(tmp_path):
     (tmp_path / "bad.csv").write_text("t,x\n0,one\n")
-    with pytest.raises(UserError, match=r"bad\.csv: is no trajectory of a run"):
+    with pytest.raises(UserError, match=r"bad\.csv: is not a trajectory of a run"):
         write_film({"a": tmp_path / "bad.csv"}, MAZE, tmp_path / "film.gif")
-    with pytest.raises(UserError, match=r"none\.csv: is no trajectory"):
+    with pytest.raises(UserError, match=r"none\.csv: is not a trajectory"):
         write_film({"a": tmp_path / "none.csv"}, MAZE, tmp_path / "film.gif")

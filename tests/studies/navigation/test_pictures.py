@@ -116,10 +116,10 @@ def test_of_a_folder_of_many_images_only_those_of_the_pool_are_read(tmp_path, mo
     ("name", "content", "message"),
     [
         ("notes.txt", b"no image", "no readable image"),
-        ("data_batch_1.bin", b"\x00" * 3000, "is no file of CIFAR-10's"),
+        ("data_batch_1.bin", b"\x00" * 3000, "is not a CIFAR-10 file"),
         ("data_batch_1.bin", b"\xff" * 3073, "labels above 9"),
-        ("data_batch_1", python_batch(b"\x00" * 100), "is no file of CIFAR-10's"),
-        ("data_batch_1", b"\xfe\xfe\xfe", "is no file of CIFAR-10's"),
+        ("data_batch_1", python_batch(b"\x00" * 100), "is not a CIFAR-10 file"),
+        ("data_batch_1", b"\xfe\xfe\xfe", "is not a CIFAR-10 file"),
         ("a.png", b"not a picture", "cannot be read as an image"),
         ("a.png", torn_png(), "cannot be read as an image"),
     ],

@@ -328,7 +328,7 @@ def test_what_makes_no_one_table_is_named(tmp_path):
     write_run(tmp_path / "one", condition, 0, 9.0)
     config = write_run(tmp_path / "other", condition, 0, 9.0) / "config.json"
     change(config, config={"batch_size": 7})
-    with pytest.raises(UserError, match="three_curtains/mik-K15 seed 0 is there twice; keep one"):
+    with pytest.raises(UserError, match="three_curtains/mik-K15 seed 0 occurs twice; keep one"):
         loaded(tmp_path / "one", tmp_path / "other")
     change(config, config={"preset": "paper", "seed": 7})
     with pytest.raises(UserError, match="different presets"):

@@ -253,7 +253,7 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
         ({"method": "ah+a", "literal_future": True}, r"--literal-future is not read by the method ah\+a"),
         (
             {"future_frames": "newest"},
-            "--future-frames newest blanks older frames of a stack, and here an observation is",
+            "--future-frames newest blanks older frames of a stack, but observations here",
         ),
         ({"steps": 0}, "--steps is 0"),
         ({"learning_rate": float("nan")}, "--learning-rate is nan"),
@@ -282,7 +282,7 @@ def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
     short = fake_rows([1, 20, 20], action_dim=2, physics_dim=4) | {"observation": np.zeros((41, 3, 100, 100), np.uint8)}
     (tmp_path / "short").mkdir()
     write_shard(tmp_path / "short" / "0.hdf5", short, {"task": "no_curtain"})
-    with pytest.raises(UserError, match="trajectory 0 is a single row, without a step; take it out of the set, or"):
+    with pytest.raises(UserError, match="trajectory 0 is a single row, without a step; remove it, or"):
         train(smoke(tmp_path / "short", tmp_path / "run"))
     rows = fake_rows([20, 20], action_dim=2) | {"observation": np.zeros((40, 3, 100, 100), np.uint8)}
     for name, attributes, message in (
@@ -301,7 +301,7 @@ def test_the_mixer_refuses_sizes_it_cannot_cut():
     assert make_frame_encoder("mixer", 3, 100, {"feature_dim": 16})(
         torch.zeros(2, 3, 100, 100, dtype=torch.uint8)
     ).shape == (2, 16)
-    with pytest.raises(UserError, match="84 is no multiple"):
+    with pytest.raises(UserError, match="84 is not a multiple"):
         make_frame_encoder("mixer", 9, 84, {"feature_dim": 16})
 
 

@@ -68,7 +68,7 @@ def test_an_action_of_the_world_is_no_place_of_one():
     env = make()
     env.reset(seed=0)
     for wrong in (-1, 2):
-        with pytest.raises(UserError, match=rf"^action {wrong}: give the place of one in \[-1, 1\], 0 to 1$"):
+        with pytest.raises(UserError, match=rf"^action {wrong}: give the index of one in \[-1, 1\], 0 to 1$"):
             env.step(wrong)
 
 

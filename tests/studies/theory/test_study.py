@@ -107,7 +107,7 @@ def test_studies_that_cannot_be_reported_are_one_line(shown, tmp_path):
     study, folder = shown
     run = write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
     (tmp_path / "theory.json").write_text(json.dumps(study | {"printed": {}}))
-    with pytest.raises(UserError, match=r"is no whole study \(.*\); write it again: vd4rl-pomdp theory --out "):
+    with pytest.raises(UserError, match=r"is not a complete study \(.*\); write it again: vd4rl-pomdp theory --out "):
         write_report([run, tmp_path], tmp_path / "out")
     with pytest.raises(UserError, match="two studies of the theory"):
         write_report([run, tmp_path, folder], tmp_path / "out")

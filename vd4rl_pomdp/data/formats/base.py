@@ -72,10 +72,10 @@ def rows_of(
     """
     steps = len(action)
     ended = terminated if isinstance(terminated, np.ndarray) else terminated & (np.arange(1, steps + 1) == steps)
-    counts = {"pictures": len(frames) - 1, "rewards": len(reward), "terminations": len(ended)}
-    for name, count in (counts | ({} if physics is None else {"states": len(physics) - 1})).items():
+    counts = {"images after the first": len(frames) - 1, "rewards": len(reward), "terminations": len(ended)}
+    for name, count in (counts | ({} if physics is None else {"states after the first": len(physics) - 1})).items():
         if count != steps:
-            raise UserError(f"has {steps} actions, but {name} for {count}")
+            raise UserError(f"has {steps} actions, but {count} {name}")
     step_type = np.full(steps + 1, StepType.MID, np.int64)
     step_type[0] = StepType.FIRST
     if complete and steps:
@@ -123,10 +123,10 @@ def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[
     """
     known = {name: size for name, shape in shapes.items() if (size := picture_size(shape))}
     if not known:
-        raise UserError("holds no pictures: those are uint8 observations of the shape (H, W), (H, W, 3) or (3, H, W)")
+        raise UserError("holds no images: expected uint8 observations of shape (H, W), (H, W, 3) or (3, H, W)")
     if picture in known or (picture is None and len(known) == 1):
         return next((name, size) for name, size in known.items() if picture in (name, None))
-    raise UserError(f"which observation holds its pictures? Pass --picture, one of {', '.join(known)}")
+    raise UserError(f"has several image observations: choose one with --picture, of {', '.join(known)}")
 
 
 def library(name: str, extra: str) -> Any:

@@ -84,7 +84,7 @@ def _info(folder: Path) -> dict[str, Any]:
     """Read and check meta/info.json."""
     path = folder / "meta" / "info.json"
     if not path.is_file():
-        raise UserError("has no meta/info.json, so it is no LeRobot set on this disk; `hf download` fetches one")
+        raise UserError("has no meta/info.json, so it is not a local LeRobot dataset; `hf download` fetches one")
     info = read_json(path)
     if not (version := str(info.get("codebase_version"))).startswith("v3."):
         raise UserError(f"is in the format {version}, not v3; convert_dataset_v21_to_v30 of LeRobot converts it")
@@ -123,7 +123,7 @@ def _stored(
                     continue
                 told = {name: _dense(table[name].combine_chunks()) for name in columns}
                 if len(table) < lengths[number] or (told["episode_index"] != number).any():
-                    raise UserError(f"{path.name} has not the rows of it that meta/episodes tells; fetch it again")
+                    raise UserError(f"{path.name} lacks rows that meta/episodes lists; fetch it again")
                 yield number, told
 
 
@@ -134,7 +134,7 @@ def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray |
         table = pq.read_table(file, columns=["episode_index", "action", *wanted])
         action = _dense(table["action"].combine_chunks())
         if action.dtype.kind != "f":
-            raise UserError(f"its actions are {action.dtype}; only those of floating point are read")
+            raise UserError(f"its actions are {action.dtype}; expected floating point")
         lows.append(action.min(0))
         highs.append(action.max(0))
         last = np.flatnonzero(np.diff(table["episode_index"].to_numpy(), append=-1))
@@ -168,7 +168,7 @@ def _dense(column: Any) -> np.ndarray:
 def _decoded(pictures: np.ndarray) -> np.ndarray:
     """Decode (T,) image files to (T, 3, H, W) uint8."""
     if None in pictures:
-        raise UserError("its pictures lie in other files than data/, which are not followed")
+        raise UserError("its images are stored outside data/, which is not supported")
     opened = (Image.open(io.BytesIO(one)) for one in pictures)
     return _stacked([np.asarray(one if one.mode == "RGB" else one.convert("RGB")) for one in opened])
 
@@ -197,8 +197,8 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
                 if len(pictures) == len(times):
                     return _stacked(pictures)
     except av.error.InvalidDataError as error:
-        raise UserError(f"{path.name} is damaged or no video; fetch it again") from error
-    raise UserError(f"{path.name} has no picture at {times[len(pictures)]:.3f} s; fetch it again")
+        raise UserError(f"{path.name} is damaged or not a video; fetch it again") from error
+    raise UserError(f"{path.name} has no frame at {times[len(pictures)]:.3f} s; fetch it again")
 
 
 def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:

@@ -33,7 +33,9 @@ def read(source: str, picture: str | None) -> SourceSet:
     try:
         dataset = minari.MinariDataset(folder) if folder else minari.load_dataset(source)
     except FileNotFoundError as error:
-        raise UserError(f"is neither a folder of Minari's nor a set it has: `minari download {source}`?") from error
+        raise UserError(
+            f"is neither a Minari folder nor an installed Minari dataset: run `minari download {source}`?"
+        ) from error
     actions = dataset.action_space
     discrete = isinstance(actions, gymnasium.spaces.Discrete)
     if not discrete and not isinstance(actions, gymnasium.spaces.Box):

@@ -23,7 +23,7 @@ def read(source: str, picture: str | None) -> SourceSet:
     path = Path(source)
     with zipfile.ZipFile(path) as file:
         if lacking := {"observations", "actions", "terminals"} - {Path(name).stem for name in file.namelist()}:
-            raise UserError(f"has no {min(lacking)!r}, so it is no set of OGBench")
+            raise UserError(f"has no {min(lacking)!r}, so it is not an OGBench dataset")
     with np.load(path) as file:  # loads only the arrays that are accessed
         action, terminals = file["actions"], file["terminals"].astype(bool)
     with _observations(path) as (_, shape, dtype):
@@ -31,9 +31,7 @@ def read(source: str, picture: str | None) -> SourceSet:
     if action.dtype.kind != "f":
         raise UserError(f"has actions of {action.dtype}, expected floating point")
     if not len(action) == len(terminals) == shape[0]:
-        raise UserError(
-            f"has {shape[0]} pictures, {len(action)} actions and {len(terminals)} terminals; fetch it again"
-        )
+        raise UserError(f"has {shape[0]} images, {len(action)} actions and {len(terminals)} terminals; fetch it again")
     ends = np.flatnonzero(terminals) + 1
     if not len(ends) or ends[-1] != len(terminals):
         raise UserError("its last episode has no end")
@@ -67,7 +65,7 @@ def _observations(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, ...], np.d
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = header(stream)
         if fortran:
-            raise UserError("stores its pictures in Fortran's order")
+            raise UserError("stores its images in Fortran order")
         yield stream, shape, dtype
 
 

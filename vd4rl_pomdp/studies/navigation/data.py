@@ -34,13 +34,13 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
         (dataset.physics is None, "holds no true states ('physics'), which the probe needs"),
     ):
         if wrong:
-            raise UserError(f"{path}: {what}; collect a set with `vd4rl-pomdp navigation collect`")
+            raise UserError(f"{path}: {what}; collect a dataset with `vd4rl-pomdp navigation collect`")
     if dataset.num_episodes < 2:
-        raise UserError(f"{path}: a single trajectory leaves none to be held out; collect more --trajectories")
+        raise UserError(f"{path}: a single trajectory leaves none to hold out; collect more --trajectories")
     if (rows := dataset.episode_end - dataset.episode_start).min() < 2:
         raise UserError(
-            f"{path}: trajectory {int(rows.argmin())} is a single row, without a step; take it out of the set, or "
-            "collect the set again"
+            f"{path}: trajectory {int(rows.argmin())} is a single row, without a step; remove it, or "
+            "collect the dataset again"
         )
     return dataset, MAZES[names.pop()]
 

@@ -206,12 +206,12 @@ class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 def train_first_person(config: FirstPersonConfig) -> Actor:
     """Train and write the actor; its card holds the number of goals reached in 20 episodes."""
     if not get_maze(config.maze).first_person:
-        raise UserError(f"--maze is {config.maze}, which a planner drives through; choose first_person")
+        raise UserError(f"--maze is {config.maze}, where a planner drives; choose first_person")
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
     refuse_no_folder(config.out.parent)
     refuse_inside(config.out)
     if config.out.exists() or config.out.is_symlink():
-        raise UserError(f"{config.out}: is there already; remove it, or choose another --out")
+        raise UserError(f"{config.out}: exists already; remove it, or choose another --out")
     try:
         from stable_baselines3 import PPO
         from stable_baselines3.common.callbacks import BaseCallback

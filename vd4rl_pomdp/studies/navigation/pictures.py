@@ -188,7 +188,7 @@ def _read_cifar(path: Path) -> np.ndarray:
         if not len(images) or (labels and images[:, 0].max() >= _CIFAR_CLASSES):
             raise ValueError("it holds no images, or labels above 9")
     except ValueError as error:
-        raise UserError(f"{path}: is no file of CIFAR-10's ({error}); download CIFAR-10 again") from error
+        raise UserError(f"{path}: is not a CIFAR-10 file ({error}); download CIFAR-10 again") from error
     return images[:, labels:].reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
 
 

@@ -100,7 +100,7 @@ def read_trajectory(path: Path) -> dict[str, np.ndarray]:
     except UserError:
         raise
     except (FileNotFoundError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path}: is no trajectory of a run ({error}); train the run again") from error
+        raise UserError(f"{path}: is not a trajectory of a run ({error}); train the run again") from error
 
 
 def find_navigation(sources: Sequence[Path], but: Path | None = None) -> list[Result]:
@@ -117,15 +117,17 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
     """
     runs = sorted((_read_run(result) for result in results if result.finished), key=lambda run: run.identity)
     if not runs:
-        raise UserError("no finished run of `vd4rl-pomdp navigation train` is there; name folders of some")
+        raise UserError("there is no finished run of `vd4rl-pomdp navigation train`; name folders that have one")
     presets = sorted({run.preset for run in runs})
     if len(presets) > 1:
-        raise UserError(f"runs of different presets ({', '.join(presets)}) do not make one table; report them apart")
+        raise UserError(
+            f"runs of different presets ({', '.join(presets)}) cannot share a table; report them separately"
+        )
     first: dict[Condition, NavigationRun] = {}
     for before, run in zip([None, *runs], runs, strict=False):
         if before is not None and before.identity == run.identity:
             places = f"{before.result.path} and {run.result.path}"
-            raise UserError(f"{places}: {run.condition.name} seed {run.seed} is there twice; keep one")
+            raise UserError(f"{places}: {run.condition.name} seed {run.seed} occurs twice; keep one")
         _refuse_mixture(first.setdefault(run.condition, run), run)
     return runs
 
@@ -137,7 +139,7 @@ def _refuse_mixture(other: NavigationRun, run: NavigationRun) -> None:
         if values[0] != values[1]:
             raise UserError(
                 f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
-                f"({', '.join(values)}) and make no mean; report them apart"
+                f"({', '.join(values)}) and cannot be averaged; report them separately"
             )
 
 
@@ -154,7 +156,7 @@ def _read_run(result: Result) -> NavigationRun:
             if value not in known:
                 raise ValueError(f"its {name} is {value!r}")
         if not results["rows"]:
-            raise ValueError("it has measured nothing")
+            raise ValueError("it has no rows")
         if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
             raise TypeError("timing.json holds no numbers")
         condition = Condition(
@@ -173,7 +175,7 @@ def _read_run(result: Result) -> NavigationRun:
         raise UserError(f"{result.place}: a {name} is {value}: the run has diverged; train it again or leave it out")
     run = NavigationRun(result, condition, values)
     if result.folder and run.trajectory is None:
-        raise UserError(f"{result.path / TRAJECTORY_FILE}: is missing or no file; train it again")
+        raise UserError(f"{result.path / TRAJECTORY_FILE}: is missing or not a file; train it again")
     return run
 
 

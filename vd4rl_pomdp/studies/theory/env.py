@@ -47,7 +47,7 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
         """Apply an action and advance the exogenous chain; UserError for an invalid action."""
         if not self.action_space.contains(action):
             last = len(self.world.actions) - 1
-            raise UserError(f"action {action}: give the place of one in {list(self.world.actions)}, 0 to {last}")
+            raise UserError(f"action {action}: give the index of one in {list(self.world.actions)}, 0 to {last}")
         state, noise = self._pair
         after = self.world.step[state, self.world.actions[int(action)]]
         self._pair = after, self._draw(self.world.drift[noise])

@@ -199,7 +199,7 @@ def _all_reached(world: World) -> None:
         lost = [name for name in names if name not in found]
         if lost:
             raise UserError(
-                f"world {world.name!r}: {kind} {lost[0]} is unreachable: drop it, or lead to it from the initial law"
+                f"world {world.name!r}: {kind} {lost[0]} is unreachable from the initial law: drop it or connect it"
             )
 
 
