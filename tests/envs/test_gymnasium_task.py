@@ -234,7 +234,9 @@ class Failing(Counter):
 
 def test_an_environment_whose_reset_takes_no_seed_is_one_line():
     env = make_env(GymnasiumTask(Seedless))
-    with pytest.raises(UserError, match=r"Seedless cannot be reset \(.* 'seed'\): an episode .* Gymnasium's") as caught:
+    with pytest.raises(
+        UserError, match=r"Seedless cannot be reset with a seed \(.* 'seed'\): give it Gymnasium's"
+    ) as caught:
         env.reset(0)
     assert "\n" not in str(caught.value)
     with pytest.raises(TypeError, match="has no len"):  # a fault of its own stays what it is

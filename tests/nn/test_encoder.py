@@ -133,7 +133,7 @@ def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
 def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
     save_encoder(tmp_path, Encoder(EncoderConfig(action_dim=6)), replace(CARD, corruption={"corruption": "fog"}))
     with pytest.raises(
-        UserError, match=r"unknown corruption 'fog'.*, or run or import the file that registers it\); mend"
+        UserError, match=r"unknown corruption 'fog'.*, or run or import the file that registers it\); correct"
     ):
         load_encoder(tmp_path)
 
@@ -186,7 +186,7 @@ def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
     config = json.loads((tmp_path / "config.json").read_text())
     config[part][field] = value
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match=r"(names no|not an) encoder") as caught:
+    with pytest.raises(UserError, match=r"(describes no|not an) encoder") as caught:
         load_encoder(tmp_path)
     assert "\n" not in str(caught.value)
     (tmp_path / "config.json").write_bytes(b"\x80\x04")
