@@ -4,10 +4,9 @@
     OMP_NUM_THREADS=1 python tools/ladder_policies.py averages --work DIR
 
 `cloning` adds missing rows to results/ladder/cloning.csv, one per finished run and rung: losses on episodes of the
-run's
-own dataset and on held-out ones, which are collected once into DIR/held_out. `averages` adds to averaged.csv: at every
-second rung, the weights of the rungs in the last half of training so far are averaged, and the average policy plays the
-rung's episodes.
+run's own dataset and on held-out ones, which are collected once into DIR/held_out. `averages` adds to averaged.csv: at
+every second rung, the weights of the rungs in the last half of training so far are averaged, and the average policy
+plays the rung's episodes.
 """
 
 from __future__ import annotations

@@ -132,8 +132,7 @@ def drift(curve: Mapping[int, float], end: int) -> float:
 def budget(cells: Sequence[Cell]) -> int | None:
     """Smallest number of updates, among the rungs, that satisfies a rule without evaluations; None if there is none.
 
-    All critics have converged there, and each held-out cloning loss is within 2% of its minimum over all such
-    rungs.
+    All critics have converged there, and each held-out cloning loss is within 2% of its minimum over all such rungs.
     """
     rungs = set.intersection(*(set(cell.converged()) for cell in cells)) if cells else set()
     lowest = [min((cell.held_out[rung] for rung in rungs), default=0.0) for cell in cells]

@@ -4,10 +4,8 @@
 
 Run it in a checkout where pip has network access. The file holds this package with its commit, its dependencies pinned
 by constraints.txt (without parts that it never imports), libraries that find the GPU's OpenGL, the tests, the grids,
-and
-`run.py`, which runs on that machine. The machine has torch and numpy. FREEZE is its `pip freeze`: packages in a
-suitable
-version there are left out. A line may be a name without a version.
+and `run.py`, which runs on that machine. The machine has torch and numpy. FREEZE is its `pip freeze`: packages in a
+suitable version there are left out. A line may be a name without a version.
 """
 
 from __future__ import annotations

@@ -4,10 +4,9 @@
     python3 card/run.py --out home --seconds 570 tests=120 bench=180 cell.toml -- --jobs-per-gpu 5 --stack 5
 
 Parts run in order, each until its own limit, those without one until the deadline: `tests` are those marked gpu,
-`bench`
-is `vd4rl-pomdp bench --gpu`, anything else is a grid of `vd4rl-pomdp sweep run`, whose further flags follow `--`. A
-grid's datasets are collected first on all cores, alongside the tests if there are any. At the deadline, trainings write
-a checkpoint into --work: the same command on this machine resumes them.
+`bench` is `vd4rl-pomdp bench --gpu`, anything else is a grid of `vd4rl-pomdp sweep run`, whose further flags follow
+`--`. A grid's datasets are collected first on all cores, alongside the tests if there are any. At the deadline,
+trainings write a checkpoint into --work: the same command on this machine resumes them.
 
 --out holds log.txt; results/, the rows of finished runs as written by `results add`; records.tar.xz, the small files of
 all runs, including metrics; and, with --bring MIB, encoders.tar.*, as many finished encoders as fit, smallest first, in

@@ -148,8 +148,7 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
 
     Args:
         json: Print one JSON object instead of a table.
-        quick: A tenth of the frames and fewer repetitions: rougher numbers; fixed costs dominate the peak memory.
-            With
+        quick: A tenth of the frames and fewer repetitions: rougher numbers; fixed costs dominate the peak memory. With
             --gpu only a test of the code.
         gpu: Benchmark the paper preset on one GPU instead: CUDA graphs, stacked seeds, the same update in JAX,
             encoding, an evaluation; under three minutes.
@@ -177,7 +176,7 @@ def certify(
     change: tuple[str, ...] = (),
     jobs: int = 0,
 ) -> None:
-    """Train supervised encoders with and without memory to decide whether a dataset needs memory. Re-run to resume.
+    """Decide with supervised encoders whether a dataset needs a memory of past observations. Re-run to resume.
 
     Args:
         data: Folder of a dataset with simulator states; the certificate is written there.

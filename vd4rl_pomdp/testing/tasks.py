@@ -25,8 +25,7 @@ def check_task(name: str) -> None:
 
     Raises:
         AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such task, or its environment cannot be built or returns no images or numeric
-            rewards.
+        UserError: there is no such task, or its environment cannot be built or returns no images or numeric rewards.
     """
     TASKS.named(name)
     run_checks("task", CHECKS, name)

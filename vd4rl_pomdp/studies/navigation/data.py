@@ -1,6 +1,6 @@
-"""A maze's set as a model sees it: windows of pictures with the true states of their rows.
+"""A maze's dataset for training: windows of images with the true states of their rows.
 
-Exogenous noise may be added to the pictures; the small presets see a quarter of their pixels, in grey.
+Exogenous noise may be added to the images; the small presets use a quarter of the pixels, in grey.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, Pict
 
 _BLOCK = 1000
 HELD_OUT = 10
-"""One in this many trajectories, the last ones, is never trained on."""
+"""One in this many trajectories, the last ones, is held out."""
 
 
 def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeSpec]:
-    """A set of maze data and its maze; raises UserError if it is of something else or holds no true states."""
+    """A maze's dataset and its maze; UserError for other datasets or without true states."""
     dataset = open_dataset(path, cache)
     attributes = dataset.store.meta["attributes"]
     names = {stored.get("task") for stored in attributes}
@@ -47,7 +47,7 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
 
 @dataclass(frozen=True)
 class TrueStates:
-    """Standardised states of all rows of a set."""
+    """Standardised states of all rows of a dataset."""
 
     values: Tensor
     """(N, 4) float32."""
@@ -55,11 +55,11 @@ class TrueStates:
     """(N,) bool: a curtain covers the whole mass."""
     mean: Tensor
     std: Tensor
-    """(4,) float32, of the training rows."""
+    """(4,) float32, over the training rows."""
 
     @classmethod
     def of(cls, dataset: Dataset, maze: MazeSpec, training_rows: int) -> TrueStates:
-        """States of a set, standardised by its first `training_rows` rows."""
+        """States of a dataset, standardised by its first `training_rows` rows."""
         assert dataset.physics is not None
         raw = torch.from_numpy(dataset.physics[:, maze.position + maze.velocity])
         std, mean = torch.std_mean(raw[:training_rows], dim=0)
@@ -72,7 +72,7 @@ class TrueStates:
 
 
 class MazeView(View):
-    """A maze's set as a model sees it: one picture a row, with the exogenous noise of its key."""
+    """Observations of a maze's dataset: one image per row, with the exogenous noise of its key."""
 
     def __init__(self, dataset: Dataset, noise: ExogenousNoise | None) -> None:
         super().__init__(dataset, frame_stack=1)
@@ -87,7 +87,7 @@ class MazeView(View):
         return noisy.view(pictures.shape)
 
     def shrunk(self, picture: Picture) -> View:
-        """The same at 50x50, drawn once for all: training then never touches the large pictures."""
+        """The same at 50x50, computed once so that training never touches the large images."""
         channels, size = SHAPES[picture]
         shrink = to_grey50 if channels == 1 else to_rgb50
         small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
@@ -98,7 +98,7 @@ class MazeView(View):
 
 
 def open_data(config: NavigationConfig) -> MazeData:
-    """The set that a config names, with its exogenous noise, on the CPU."""
+    """The config's dataset, with its exogenous noise, on the CPU."""
     noise = None
     if isinstance(config.noise, NoiseOptions):
         noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
@@ -106,7 +106,7 @@ def open_data(config: NavigationConfig) -> MazeData:
 
 
 class MazeData:
-    """Batches of a maze's set: the first trajectories are for training, the last tenth is held out."""
+    """Batches of a maze's dataset: the last tenth of the trajectories is held out, the others are for training."""
 
     def __init__(
         self, dataset: Dataset, maze: MazeSpec, config: NavigationConfig, noise: ExogenousNoise | None
@@ -121,10 +121,10 @@ class MazeData:
         """(M, 2) float32."""
         self.total = dataset.num_windows(config.window)
         self.training = int(dataset.windows_per_episode(config.window)[: self.first_held_out].sum())
-        """Windows 0..training-1 are for training, the rest is held out."""
+        """Windows 0..training-1 are for training, the others are held out."""
         self.view: View = MazeView(dataset, noise)
         self.inputs = {"data": dataset.fingerprint} | ({} if noise is None else {"exogenous": noise.fingerprint()})
-        """What a run on it reads, by name and content."""
+        """Fingerprints of a run's inputs by name."""
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""
@@ -135,11 +135,11 @@ class MazeData:
         return self
 
     def windows(self, number: Tensor, length: int | None = None) -> Windows:
-        """Windows by (B,) numbers, as the model sees them."""
+        """Windows by (B,) numbers, as observed by the model."""
         return self.view.windows(number, length or self._config.window)
 
     def spread(self, count: int, held_out: bool) -> list[Tensor]:
-        """Numbers of `count` windows, evenly spread over the training or the held-out ones, in batches."""
+        """Numbers of `count` windows, evenly spaced over the training or held-out ones, in batches."""
         first, last = (self.training, self.total) if held_out else (0, self.training)
         numbers = torch.linspace(first, last - 1, min(count, last - first)).long()
         return list(numbers.split(self._config.batch_size))

@@ -1,12 +1,12 @@
-"""What an objective needs of its representation: the coarsest partitions of histories that determine its predictions.
+"""Requirements of an objective on its representation: coarsest partitions of histories that determine its predictions.
 
-At its optimum an objective knows F_k(x, y) = P(a_t | x, y) for every history x and later view y that occur together. A
-representation phi is enough if F_k is a function of phi(x) and phi(y) (of phi(x) and y, where the later view is one of
-the future and has an encoder of its own). Every refinement of such a phi is enough, too, so:
+At its optimum, an objective knows F_k(x, y) = P(a_t | x, y) for every history x and later view y that occur together. A
+representation phi is sufficient if F_k is a function of phi(x) and phi(y) (of phi(x) and y, if the later view is a
+future with its own encoder). Every refinement of a sufficient phi is sufficient. So:
 
-- two histories *must differ* if putting just these two together contradicts F: no optimal representation merges them;
-- a partition is *coarsest* if no two of its blocks can be put together. F is silent about pairs that never occur
-  together, so there may be several; they are found by first fit, from more than one order, and the smallest is shown.
+- two histories *must differ* if merging just these two contradicts F: no optimal representation merges them;
+- a partition is *coarsest* if no two of its blocks can be merged. F is undefined for pairs that never occur together,
+  so there may be several; first fit from more than one order finds some, and the smallest is used.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vd4rl_pomdp.studies.theory.views import ObjectiveView
 from vd4rl_pomdp.studies.theory.world import World
 
 History = tuple
-"""Values of what a representation is computed from, oldest first."""
+"""Inputs of a representation, oldest first."""
 
 
 class Relation:
@@ -33,10 +33,10 @@ class Relation:
     def __init__(self, world: World, shared: bool) -> None:
         self.world = world
         self.shared = shared
-        """Whether one representation serves both ends."""
+        """Whether one representation encodes both ends."""
         self.histories: dict[History, int] = {}
         self.acted: dict[int, tuple] = {}
-        """History -> the actions it shows, oldest first."""
+        """Actions in a history, oldest first."""
         self._laters: dict[tuple, int] = self.histories if shared else {}
         self._contents: dict[tuple, int] = {}
         self._predictions: dict[Prediction, int] = {}
@@ -52,12 +52,12 @@ class Relation:
         self._entries.append(np.stack([np.full_like(past, k), past, later, values]))
 
     def add_facts(self, law: Law, past: Iterable[Variable], content: Iterable[Variable], row: int) -> None:
-        """Record the states, exogenous states and contents that histories which end at a row may have.
+        """Record the possible states, exogenous states and contents of histories that end at a row.
 
         Args:
             law: of `past`, `content` and the s and xi of `row`.
-            past: what histories consist of.
-            content: their agent-centric content: the states of the rows they show, and the actions they show.
+            past: variables of the histories.
+            content: their agent-centric content: the states of their rows, and their actions.
             row: their last row.
         """
         history = _numbers(self.histories, past, law)
@@ -76,17 +76,17 @@ class Relation:
 
     @cached_property
     def states(self) -> np.ndarray:
-        """(H, S) bool: agent-centric states that a history may end in; one, if it decodes."""
+        """(H, S) bool: possible final agent-centric states of a history; exactly one if it decodes the state."""
         return self._incidence("s", len(self.world.states))
 
     @cached_property
     def noises(self) -> np.ndarray:
-        """(H, X) bool: exogenous states that a history may end in."""
+        """(H, X) bool: possible final exogenous states of a history."""
         return self._incidence("xi", len(self.world.exogenous))
 
     @cached_property
     def contents(self) -> np.ndarray:
-        """(P, 2): each history with each agent-centric content that it may have."""
+        """(P, 2): each history with each possible agent-centric content."""
         return np.concatenate(self._facts["content"])
 
     def _incidence(self, kind: str, width: int) -> np.ndarray:
@@ -95,7 +95,7 @@ class Relation:
         return table
 
     def conflicts(self) -> np.ndarray:
-        """(H, H) bool: pairs of histories that every representation that is enough keeps apart."""
+        """(H, H) bool: pairs of histories that every sufficient representation separates."""
         k, past, later, value = self.entries
         found = np.zeros((len(self.histories),) * 2, bool)
         _mark_differing(found, past, number_rows([k, later])[0], value)
@@ -106,7 +106,7 @@ class Relation:
         return found | found.T
 
     def _contradict_as_one(self, entries: np.ndarray) -> np.ndarray:
-        """(H, H): pairs of histories that, put together, would need several predictions for one pair at this k."""
+        """(H, H): pairs of histories that cannot be merged, as some pair would need several predictions at this k."""
         past, later, value = entries
         table = np.full((len(self.histories),) * 2, -1, np.int32)
         table[past, later] = value
@@ -117,13 +117,13 @@ class Relation:
         return low < high
 
     def factors(self, codes: np.ndarray) -> bool:
-        """Whether F is a function of the codes of both sides; codes (H,) integers."""
+        """Whether F is a function of both sides' codes; codes (H,) integers."""
         k, past, later, value = self.entries
         key, first = number_rows([k, codes[past], codes[later] if self.shared else later])
         return bool((value == value[first][key]).all())
 
     def coarsest(self) -> np.ndarray:
-        """(H,) integers: a coarsest partition, the smallest of those that the orders lead to."""
+        """(H,) integers: the smallest of the coarsest partitions found."""
         names = np.fromiter(self.world.states, object, len(self.world.states))
         ends = [repr(sorted(names[row], key=repr)) for row in self.states]
         recent = [repr(self.acted[h][::-1]) for h in range(len(ends))]
@@ -131,7 +131,7 @@ class Relation:
         return min(found, key=lambda blocks: len(set(blocks)))
 
     def _first_fit(self, groups: Sequence[str], ends: Sequence[str]) -> np.ndarray:
-        """Blocks by first fit: at first within groups (of equal states, or of equal actions), then across them."""
+        """Blocks by first fit: first within groups (equal states, or equal actions), then across them."""
         texts = [repr(history) for history in self.histories]
         order = sorted(range(len(texts)), key=lambda h: (groups[h], ends[h], texts[h]))
         blocks = _Blocks(self._tables(), self.shared)
@@ -140,7 +140,7 @@ class Relation:
         return np.unique([blocks.find(h) for h in range(len(texts))], return_inverse=True)[1]
 
     def _tables(self) -> np.ndarray:
-        """(K, H, L): the prediction for every k, history and other side, -1 where they never occur together."""
+        """(K, H, L): prediction for every k, history and other side, -1 for pairs that never occur."""
         k, past, later, value = self.entries
         place = np.unique(k, return_inverse=True)[1]
         tables = np.full((int(place.max()) + 1, len(self.histories), len(self._laters)), -1)
@@ -149,7 +149,7 @@ class Relation:
 
 
 class _Blocks:
-    """Blocks of histories, each named by its first member, with the tables of F between blocks."""
+    """Union-find over blocks of histories, named by their first member, with the tables of F between blocks."""
 
     def __init__(self, tables: np.ndarray, shared: bool) -> None:
         self.tables, self.shared = tables, shared
@@ -162,7 +162,8 @@ class _Blocks:
         return name
 
     def join(self, order: Iterable[int], allowed: Callable[[int, int], bool]) -> list[int]:
-        """Put every block, in order, into the first earlier one that is allowed and fits; returns what is left."""
+        """Merge every block, in order, into the first earlier block that is allowed and fits; returns the remaining
+        ones."""
         heads: list[int] = []
         for name in order:
             head = next((h for h in heads if allowed(h, name) and self.fit(h, name)), None)
@@ -173,7 +174,7 @@ class _Blocks:
         return heads
 
     def fit(self, one: int, other: int) -> bool:
-        """Whether two blocks put together contradict nothing."""
+        """Whether merging two blocks causes no contradiction."""
         both = [one, other]
         if _differ(self.tables[:, both], axis=1):
             return False
@@ -183,7 +184,7 @@ class _Blocks:
         return not (_differ(self.tables[:, :, both], axis=2) or _differ(between, axis=1))
 
     def _merge(self, head: int, name: int) -> None:
-        """Give a block the entries of another, which are equal where both have one."""
+        """Merge a block's entries into another's; where both have one, they are equal."""
         self.parent[name] = head
         for side in (self.tables, self.tables.swapaxes(1, 2)) if self.shared else (self.tables,):
             side[:, head] = np.maximum(side[:, head], side[:, name])
@@ -191,19 +192,19 @@ class _Blocks:
 
 
 def _differ(values: np.ndarray, axis: int) -> bool:
-    """Whether known values (those that are not -1) differ anywhere along an axis."""
+    """Whether known values (not -1) differ anywhere along an axis."""
     low = np.where(values < 0, values.max(initial=0), values).min(axis)
     return bool((low < values.max(axis)).any())
 
 
 def _numbers(known: dict[tuple, int], group: Iterable[Variable], law: Law) -> np.ndarray:
-    """(N,) numbers of the joint values of a group; values that are not known yet get the next ones."""
+    """(N,) numbers of the joint values of a group; new values get the next numbers."""
     ids, first = law.numbered(group)
     return np.array([known.setdefault(name, len(known)) for name in law.values(group, first)])[ids]
 
 
 def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value: np.ndarray) -> None:
-    """Mark each two of (E,) entries that have one key and two values."""
+    """Mark all pairs of (E,) entries with equal keys and different values."""
     order = np.argsort(key, kind="stable")
     mine, key, value = mine[order], key[order], value[order]
     for gap in range(1, int(np.bincount(key).max())):
@@ -214,8 +215,8 @@ def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value:
 def relation(world: World, view: ObjectiveView, memory: MemoryLengths, ks: Iterable[int]) -> Relation:
     """F of one objective on a world, for some k.
 
-    Where the past is a window, one t with a whole window stands for all. Where it is the whole history, every pair
-    within the rows m..m+K is taken, because one late history must serve all earlier t.
+    For windowed pasts, one t with a whole window represents all. For whole histories, every pair within rows m..m+K is
+    used, since one late history must serve all earlier t.
     """
     ks, first = list(ks), first_row(view, memory)
     found, histories = Relation(world, shared=not view.masked), {}
@@ -244,12 +245,12 @@ def state_relation(world: World, ks: Iterable[int]) -> Relation:
 
 
 def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
-    """For every pair of states, the share of pairs of their histories that every optimal representation separates.
+    """For every pair of states, the fraction of pairs of their histories that every optimal representation separates.
 
-    Only histories that may have the same exogenous state are paired: others can be told apart by what the future shows
-    of the exogenous state.
+    Only histories that may have the same exogenous state are paired: others may be distinguishable by the exogenous
+    part of the future.
     """
-    ends, noises = found.states.astype(float), found.noises.astype(float)  # whole numbers, far below 2^53: exact
+    ends, noises = found.states.astype(float), found.noises.astype(float)  # integers far below 2^53: exact
     eligible = noises @ noises.T > 0
     possible, forced = (ends.T @ pairs.astype(float) @ ends for pairs in (eligible, found.conflicts() & eligible))
     names = found.world.states
@@ -260,14 +261,14 @@ def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
 
 
 def discards_noise(found: Relation) -> bool:
-    """Whether F depends on the agent-centric content of histories alone, so that what differs in noise can be one."""
+    """Whether F depends only on the agent-centric content of histories, so that noise can be discarded."""
     return found.factors(_linked(found.contents))
 
 
 def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
-    """Class of each state: states that a partition of histories cannot tell apart share one.
+    """Class of each state: states that a partition of histories cannot distinguish share one.
 
-    They share a block at an equal exogenous state, directly or through others.
+    These share a block at an equal exogenous state, directly or through others.
     """
     history, noise = np.nonzero(found.noises)
     table = np.zeros((found.states.shape[1], int(blocks.max()) + 1, found.noises.shape[1]), bool)
@@ -278,7 +279,7 @@ def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
 
 
 def _linked(pairs: np.ndarray) -> np.ndarray:
-    """Classes of the left numbers of (P, 2) pairs: those that share a right number, directly or through others."""
+    """Connected components of the left numbers of (P, 2) pairs, linked by equal right numbers."""
     left, right = pairs.T
     label = np.arange(int(left.max()) + 1)
     while True:

@@ -1,4 +1,5 @@
-"""What `vd4rl-pomdp theory` computes: the paper's Table 1 and equations beside enumeration on the gallery's worlds."""
+"""Computations of `vd4rl-pomdp theory`: the paper's Table 1 and equations, compared with enumeration on small
+worlds."""
 
 from __future__ import annotations
 
@@ -43,14 +44,14 @@ from vd4rl_pomdp.studies.theory.world import (
 
 MAX_K = 10
 GAPS = 4
-"""How many k are tried, from the first one that a statement is about."""
+"""Number of k to try, from the first one to which a statement applies."""
 
 
 def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Action, ...], AgentState]]:
-    """Every (s_t, (a_t..a_{t+k-1}), s_{t+k}).
+    """All (s_t, (a_t..a_{t+k-1}), s_{t+k}).
 
-    The paper's counterexample is about these (section 3.2 and appendix): it generates all of them for k = 1..10 and
-    asks, for each pair of states, how the first action is distributed.
+    As in the paper's counterexample (section 3.2 and appendix), which generates them for k = 1..10 and considers the
+    distribution of the first action for each pair of states.
     """
     found = []
     for start in world.states:
@@ -63,7 +64,7 @@ def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Actio
 
 
 def examples_by_k(world: World) -> list[dict[str, int]]:
-    """One row for every k: examples, pairs of states, and at how many of them the first action is known or uniform."""
+    """One row per k: number of examples and state pairs, and of pairs with a certain or uniform first action."""
     rows = []
     for k in range(1, MAX_K + 1):
         first: dict[tuple[AgentState, AgentState], Counter[Action]] = {}
@@ -77,7 +78,7 @@ def examples_by_k(world: World) -> list[dict[str, int]]:
 
 
 def enumerated(world: World) -> dict[str, Any]:
-    """What enumeration says of the counterexample, with one of the paper's two action sets."""
+    """Enumeration of the counterexample with one of the paper's two action sets."""
     rows = examples_by_k(world)
     return {
         "actions": list(world.actions),
@@ -96,7 +97,7 @@ def enumerated(world: World) -> dict[str, Any]:
 
 
 def least_memory(world: World) -> MemoryLengths:
-    """The least m and n with actions; where no n decodes, that of the literal reading, or 0 if none does either."""
+    """Smallest decoding m and n with actions; if no n decodes, the literal reading's, or 0 if it has none."""
     m = past_memory(world, actions=True)
     ns = [future_memory(world, actions=True, literal=literal) for literal in (False, True)]
     assert m is not None, f"{world.name}: no past decodes"
@@ -105,12 +106,12 @@ def least_memory(world: World) -> MemoryLengths:
 
 @dataclass(frozen=True)
 class Fact:
-    """A number of a world, as a statement of the paper has it and as it is."""
+    """A number that the paper claims of a world, and its computed value."""
 
     title: str
-    """What is true, in a line."""
+    """The true statement, in one line."""
     printed: str
-    """What the paper prints, and where."""
+    """The paper's statement, and where."""
     world: str
     quantity: str
     claimed: str
@@ -151,13 +152,13 @@ CLAIMED = {
     ),
     "FJ+A's jumps beyond m may need the exogenous part": "FJ+A discards exogenous noise (Table 1)",
 }
-"""What the paper prints, and where, by what is true instead."""
+"""The paper's statement, and where, by the true statement."""
 
 
 def facts() -> list[Fact]:
-    """Where text and enumeration differ, in the order of `CLAIMED`: one row for each world that shows it.
+    """Differences between text and enumeration, in the order of `CLAIMED`: one row per world that shows one.
 
-    Every world meets the assumptions of the statement that it contradicts. Window lengths m and n are the least that
+    Every world meets the assumptions of the statement that it contradicts. Window lengths m and n are the smallest that
     decode.
     """
     theirs, main = counterexample(), counterexample((0, 1))
@@ -192,11 +193,11 @@ def facts() -> list[Fact]:
 
 
 _Row = tuple[str, str, str, str]
-"""World, quantity, claimed and computed number."""
+"""World, quantity, claimed and computed value."""
 
 
 def _prediction(world: World, method: str, first_k: int) -> _Row:
-    """The first k, of GAPS, at which a method is not the multi-step inverse: where, and both probabilities."""
+    """The first k, of GAPS, at which a method differs from the multi-step inverse: where, and both probabilities."""
     memory = least_memory(world)
     for k in range(first_k, first_k + GAPS):
         if found := clash(world, VIEWS[method], memory, k):
@@ -208,7 +209,7 @@ def _prediction(world: World, method: str, first_k: int) -> _Row:
 
 
 def _jumps(world: World) -> _Row:
-    """States that FJ+A tells apart by jumps beyond m, beside those by shorter ones and by the literal MIK+A."""
+    """State pairs that FJ+A separates with jumps beyond m, compared with shorter ones and with the literal MIK+A."""
     m = least_memory(world).m
     near, far = (always_apart(relation(world, VIEWS["fj+a"], MemoryLengths(m, m), range(1, k + 1))) for k in (m, m + 2))
     masked = always_apart(relation(world, VIEWS["mik+a literal"], MemoryLengths(m, m), range(1, m + 1)))
@@ -222,20 +223,20 @@ def _jumps(world: World) -> _Row:
 
 
 def _merged(world: World) -> _Row:
-    """States that MIK+A's past encoder has to tell apart, with both actions equally likely."""
+    """State pairs that MIK+A's past encoder must separate, with both actions equally likely."""
     reach = _reach(world)
     apart, pairs = always_apart(relation(world, VIEWS["mik+a"], least_memory(world), range(1, reach + 1)))
     return world.name, f"pairs of states apart by mik+a, k up to {reach}", f"{pairs} of {pairs}", f"{apart} of {pairs}"
 
 
 def _codes(world: World) -> _Row:
-    """Codes that one encoder on true states needs at both ends, at every k up to twice the diameter."""
+    """Codes that a shared encoder on true states needs for every k up to twice the diameter."""
     codes = len(set(state_relation(world, range(1, 2 * _reach(world) + 1)).coarsest().tolist()))
     return world.name, f"codes on true states, k up to {2 * _reach(world)}", str(len(world.states)), str(codes)
 
 
 def _noise(world: World) -> _Row:
-    """The first of two k beyond m up to which FJ+A's prediction depends on the exogenous part of its past."""
+    """The first of two maximum k beyond m at which FJ+A's prediction depends on the exogenous part of its past."""
     memory = least_memory(world)
     needed = (
         k
@@ -246,7 +247,7 @@ def _noise(world: World) -> _Row:
 
 
 def always_apart(found: Relation) -> tuple[int, int]:
-    """Pairs of states all of whose histories every optimal representation separates, and all pairs."""
+    """Number of state pairs that every optimal representation separates for all histories, and of all pairs."""
     shares = forced_shares(found).values()
     return sum(share == 1 for share in shares), len(shares)
 
@@ -272,12 +273,12 @@ DIAGRAMS = (("fj", 3), ("fj+a", 3), ("fj+a", 5), ("mik+a", 3), ("mik+a literal",
 
 
 def printed(method: str) -> dict[str, bool]:
-    """The printed row of a method; a literal reading is compared with the same row."""
+    """The printed row of a method; literal readings share it."""
     return PRINTED[method.removesuffix(" literal")]
 
 
 def theory_study() -> dict[str, Any]:
-    """Compute the counterexample's numbers, Table 1, the equations, the facts and the merged states, JSON-ready."""
+    """Compute counterexample, Table 1, equations, facts and merged states, JSON-serialisable."""
     cases = {name: make_case(name) for name in WORLDS}
     rows = [row for case in cases.values() for row in comparisons(case)]
     needs = [row for case in cases.values() for row in representations(case)]
@@ -310,19 +311,19 @@ def theory_study() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """One world with its variants, and the lengths its classifiers are computed with."""
+    """One world with its variants, and its window lengths and maximum k."""
 
     name: str
     worlds: dict[tuple[bool, bool], World]
-    """By (noise, state-dependent policy)."""
+    """Variants by (noise, state-dependent policy)."""
     memory: MemoryLengths
     diameter: int
     max_k: int
-    """Largest k: the diameter, or m + 2 if that is more."""
+    """Largest k: max(diameter, m + 2)."""
 
 
 def make_case(name: str) -> Case:
-    """A world of the gallery as a case: its memory lengths and diameter are computed."""
+    """A world as a case, with computed memory lengths and diameter."""
     world = WORLDS[name]()
     memory, reach = least_memory(world), diameter(world)
     assert reach is not None
@@ -347,7 +348,7 @@ def describe(case: Case) -> Row:
 
 
 def comparisons(case: Case) -> list[Row]:
-    """One row for every variant, method and k. With noise, k goes to the diameter only: sequences are many more."""
+    """One row per variant, method and k. With noise, k stops at the diameter, since there are many more sequences."""
     return [
         {"world": case.name, "noise": noise, "state_dependent": biased, "method": method}
         | asdict(compare(world, VIEWS[method], case.memory, k))
@@ -358,9 +359,9 @@ def comparisons(case: Case) -> list[Row]:
 
 
 def representations(case: Case) -> list[Row]:
-    """One row for every policy and method: which pairs of states are forced apart, and whether noise can be dropped.
+    """One row per policy and method: state pairs that must be separated, and whether noise can be discarded.
 
-    k goes up to the diameter; methods that do not see the whole history have a second row where `max_k` is more.
+    k goes up to the diameter; methods without the whole history have a second row if `max_k` is larger.
     """
     rows = []
     for biased in (False, True):
@@ -380,7 +381,7 @@ def representations(case: Case) -> list[Row]:
 
 
 def method_row(rows: list[Row], needs: list[Row]) -> Row:
-    """Table 1's row of one method on one world, from its comparisons and its representations.
+    """A method's row of Table 1 on one world, from its comparisons and its representations.
 
     A property is true if it holds in every variant and at every k; for representations, up to the largest k.
     """
@@ -417,12 +418,11 @@ EQUATIONS = (
     ("mik+a", "every k", "multi_step"),
     ("mik+a literal", "every k", "multi_step"),
 )
-"""Closed forms that section 3.1 states for classifiers: a method, one of RANGES, and one of FORMS, which are fields of
-`Comparison`."""
+"""Closed forms of classifiers in section 3.1: a method, one of RANGES, and one of FORMS (fields of `Comparison`)."""
 
 
 def compare_equations(rows: list[Row], memories: dict[str, MemoryLengths]) -> list[Row]:
-    """For every equation and world: at which of its k it holds or fails, and whether its assumptions are met."""
+    """For every equation and world: the k at which it holds or fails, and whether its assumptions are met."""
     found = []
     for (method, where, form), (world, memory) in product(EQUATIONS, memories.items()):
         mine = [
@@ -440,7 +440,7 @@ def compare_equations(rows: list[Row], memories: dict[str, MemoryLengths]) -> li
 
 @dataclass(frozen=True)
 class Difference:
-    """An entry of Table 1, or an equation, that a world contradicts which meets the method's assumptions."""
+    """An entry of Table 1 or an equation, contradicted by a world that meets the method's assumptions."""
 
     world: str
     method: str
@@ -449,9 +449,9 @@ class Difference:
 
 
 def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Difference]:
-    """What is printed beside what is computed, wherever the two differ and the method decodes the states.
+    """Differences between printed and computed entries, for methods that decode the states.
 
-    A printed no says that a property is not guaranteed, so a world that has the property does not contradict it.
+    A printed no means that a property is not guaranteed, so a world with the property does not contradict it.
     """
     found = []
     for world, table in tables.items():
@@ -470,7 +470,7 @@ def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Diff
 
 
 def diagrams(case: Case) -> list[Row]:
-    """For some objectives, the counterexample's states in classes that a coarsest partition cannot tell apart."""
+    """For some objectives, the classes of the counterexample's states that a coarsest partition cannot distinguish."""
     world = case.worlds[False, False]
     found = [
         _diagram(f"{method}, k <= {max_k}", relation(world, VIEWS[method], case.memory, range(1, max_k + 1)))
