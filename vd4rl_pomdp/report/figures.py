@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import matplotlib as mpl
@@ -51,18 +50,14 @@ MANY = 300
 """Number of dots above which a figure's dots are rasterised."""
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A figure and its description."""
+class Plot(NamedTuple):
+    """A figure, its data as in its CSV file, the base name of its files, and alternative text in words."""
 
     name: str
-    """Base name of its files."""
     caption: str
     words: str
-    """Alternative text for readers who cannot see it."""
     figure: Figure
     rows: pd.DataFrame
-    """Its data, as in its CSV file."""
 
 
 def looks_of(names: Iterable[str]) -> dict[str, int]:
@@ -199,11 +194,11 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
 
     Titles have the data's score, which `gates` tell; `looks` is the style number of every label.
     """
-    data = {
-        (row["task"], row["quality"]): row["data_return"] / TASKS[row["task"]].score_divisor
-        for row in gates.to_dict("records")
-        if pd.notna(row["data_return"]) and row["task"] in TASKS
-    }
+    titles = {}
+    for row in gates.to_dict("records"):
+        if pd.notna(row["data_return"]) and row["task"] in TASKS:
+            place, score = f"{row['task']} {row['quality']}", row["data_return"] / TASKS[row["task"]].score_divisor
+            titles[place] = f"{place} (data score {score:.1f})"
     seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table), kind="seed")
     dots = seeds.groupby([*SETTING, "label"])["score"].agg(list).to_dict()
 
@@ -227,10 +222,6 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
         if axes.dataLim.x0 >= 0:
             axes.set_xlim(left=0)
 
-    def title(place: str, rows: pd.DataFrame) -> str:
-        known = data.get((rows["task"].iloc[0], rows["quality"].iloc[0]))
-        return place if known is None else f"{place} (data score {known:.1f})"
-
     def shown(rows: pd.DataFrame) -> pd.DataFrame:
         columns = ["kind", *SETTING, "label", "seed", "score", "low", "high", "seeds", "best_score", "missing"]
         both = pd.concat([rows.assign(kind="mean"), seeds[seeds["corruption"] == rows["corruption"].iloc[0]]])
@@ -242,7 +233,9 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
         "seeds are missing, unfinished or diverged."
     )
     scored = summary[summary["score"].notna()]
-    return _plots(scored, "scores", caption, draw, "score", 2, title, shown, lambda rows: 0.3 + 0.2 * max(len(rows), 4))
+    return _plots(
+        scored, "scores", caption, draw, "score", 2, titles, shown, lambda rows: 0.3 + 0.2 * max(len(rows), 4)
+    )
 
 
 def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str, **more: Any) -> None:
@@ -288,14 +281,14 @@ def _plots(
     draw: Draw,
     value: str,
     columns: int = 3,
-    title: Callable[[str, pd.DataFrame], str] = lambda place, rows: place,
+    titles: Mapping[str, str] = {},
     shown: Callable[[pd.DataFrame], pd.DataFrame] = lambda rows: rows,
     height: Callable[[pd.DataFrame], float] = lambda rows: HEIGHT,
 ) -> list[Plot]:
     """One figure per corruption, one panel per task and quality."""
     plots = []
     for corruption, rows, places in _figures(table):
-        panels = [(title(place, members), members, draw) for place, members in places]
+        panels = [(titles.get(place, place), members, draw) for place, members in places]
         figure = sheet(panels, columns, [height(members) for _, members in places])
         told = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows['seeds'])}"
         plots.append(Plot(file_name(name, corruption), told, _told(places, value), figure, shown(rows)))
