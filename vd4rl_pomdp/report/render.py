@@ -39,7 +39,8 @@ def texts(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
         if isinstance(what, str):
             return one_line(str(row[what]))
         *names, digits = what
-        return (number if len(names) == 1 else with_interval)(*(row[name] for name in names), digits)
+        in_words: Callable[..., str] = number if len(names) == 1 else with_interval
+        return in_words(*(row[name] for name in names), digits)
 
     shown = [{title: text(row, what) for title, what in columns.items()} for row in rows.to_dict("records")]
     return pd.DataFrame(shown, rows.index, columns=list(columns))

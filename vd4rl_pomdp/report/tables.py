@@ -149,7 +149,8 @@ def improvement(evaluated: pd.DataFrame) -> pd.DataFrame:
         for name, other in combinations(final, 2):
             if common := [task for task in final[name] if task in final[other]]:
                 both = [(final[name][task], final[other][task]) for task in common]
-                found = stats.improvement_interval(*zip(*both, strict=True), np.random.default_rng(0), MANY)
+                strata, others = [one for one, _ in both], [another for _, another in both]
+                found = stats.improvement_interval(strata, others, np.random.default_rng(0), MANY)
                 pairs = [len(a) * len(b) for a, b in both]
                 chances = [stats.probability_of_improvement([a], [b]) for a, b in both]
                 low, high = found or (None, None)

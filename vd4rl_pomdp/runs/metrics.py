@@ -202,7 +202,7 @@ class Wandb:
         name = (folder / "id").read_text(encoding="ascii").strip()
         for earlier in folder.glob(f"offline-run-*-{name}"):  # `wandb sync` rejects the files of a killed process
             shutil.rmtree(earlier)
-        waits = {"init_timeout": INIT_TIMEOUT_S, "finish_timeout": FINISH_TIMEOUT_S}
+        waits: dict[str, Any] = {"init_timeout": INIT_TIMEOUT_S, "finish_timeout": FINISH_TIMEOUT_S}
         whole = run.config | dict(labels) | {"stage": run.stage, "inputs": run.inputs}
         self._run = wandb.init(
             project=PROJECT,
