@@ -289,36 +289,19 @@ class ReturnClaim(NamedTuple):
     """Claims that it is tested together with; exploratory: none."""
 
 
+_MIK_A, _MIK, _ACRO = Contender("mik+a"), Contender("mik"), Contender("acro")
 CLAIMS = (
-    ReturnClaim("acro returns less where pixels are hidden", Contender("acro", clean=True), Contender("acro")),
-    ReturnClaim("a memory pays: mik above acro", Contender("mik"), Contender("acro"), family=PRIMARY),
-    ReturnClaim(
-        "a memory pays: acro with a GRU above acro",
-        Contender("acro", history="gru"),
-        Contender("acro"),
-        family=PRIMARY,
-    ),
-    ReturnClaim("past actions pay: mik+a above mik", Contender("mik+a"), Contender("mik"), family=PRIMARY),
-    ReturnClaim("both pay: mik+a above acro", Contender("mik+a"), Contender("acro"), family=PRIMARY),
-    ReturnClaim("mik+a above ah+a", Contender("mik+a"), Contender("ah+a"), family=SECOND),
-    ReturnClaim("mik+a above fj+a", Contender("mik+a"), Contender("fj+a"), family=SECOND),
-    ReturnClaim("mik+a is above every other method", Contender("mik+a"), Contender()),
-    ReturnClaim(
-        "with nothing hidden, mik+a is not below acro",
-        Contender("mik+a"),
-        Contender("acro"),
-        hidden=False,
-        kind="not below",
-    ),
-    ReturnClaim(
-        "what is left to a memory that was told the states",
-        Contender("supervised+a"),
-        Contender("mik+a"),
-        kind=DISTANCE,
-    ),
-    ReturnClaim(
-        "what is left to the states themselves", Contender("state", clean=True), Contender("mik+a"), kind=DISTANCE
-    ),
+    ReturnClaim("acro returns less where pixels are hidden", Contender("acro", clean=True), _ACRO),
+    ReturnClaim("a memory pays: mik above acro", _MIK, _ACRO, family=PRIMARY),
+    ReturnClaim("a memory pays: acro with a GRU above acro", Contender("acro", "gru"), _ACRO, family=PRIMARY),
+    ReturnClaim("past actions pay: mik+a above mik", _MIK_A, _MIK, family=PRIMARY),
+    ReturnClaim("both pay: mik+a above acro", _MIK_A, _ACRO, family=PRIMARY),
+    ReturnClaim("mik+a above ah+a", _MIK_A, Contender("ah+a"), family=SECOND),
+    ReturnClaim("mik+a above fj+a", _MIK_A, Contender("fj+a"), family=SECOND),
+    ReturnClaim("mik+a is above every other method", _MIK_A, Contender()),
+    ReturnClaim("with nothing hidden, mik+a is not below acro", _MIK_A, _ACRO, hidden=False, kind="not below"),
+    ReturnClaim("what is left to a memory that was told the states", Contender("supervised+a"), _MIK_A, kind=DISTANCE),
+    ReturnClaim("what is left to the states themselves", Contender("state", clean=True), _MIK_A, kind=DISTANCE),
 )
 
 
