@@ -49,30 +49,6 @@ WORLDS = {"shorter counter": lambda: counterexample(every=2), "random": random_w
 ROWS = {"shorter counter": 5, "random": 4}
 
 
-def test_windows_are_every_sequence_once_and_as_likely_as_its_actions():
-    """A coin that shows heads three times in four decides whether to stay or to change sides."""
-    world = finite_world(
-        "coin",
-        states=[0, 1],
-        exogenous=["-"],
-        actions=["stay", "change"],
-        step=lambda s, a: s if a == "stay" else 1 - s,
-        drift=lambda xi: {"-": 1},
-        emit=lambda s, xi: {s: 1},
-        policy=lambda s, xi: {"stay": Fraction(3, 4), "change": Fraction(1, 4)},
-        initial={(0, "-"): 1},
-    )
-    exact = exact_windows(world, 3)
-    assert len(exact.probability) == 8, "three actions, of two kinds each"
-    changes = exact.windows.action[..., 1]
-    for window, probability in enumerate(exact.probability.tolist()):
-        expected = 0.75 ** (3 - int(changes[window].sum())) * 0.25 ** int(changes[window].sum())
-        assert probability == pytest.approx(expected)
-        sides = changes[window, :2].cumsum(0) % 2
-        assert exact.state[window].tolist() == [0, *sides.int().tolist()]
-        assert exact.windows.obs[window, :, 1, 0, 0].tolist() == [0, *(255 * sides).int().tolist()]
-
-
 def build(world: World, method: str, max_k: int, m: int = M, hidden: int = 32) -> InverseObjective:
     torch.manual_seed(0)
     name, count = method.removesuffix(" literal"), len(world.actions)

@@ -48,14 +48,10 @@ class ExogenousNoise:
     """Adds `weight` times an image of the pool to each picture and clips."""
 
     def __init__(self, source: str, weight: float, seed: int) -> None:
-        self._source, self._weight = source, weight
+        self._weight = weight
         self._seed = stream_seed(seed, "exogenous", "choice")
         self.pool = load_pool(source, seed)
         """(P, 3, 100, 100) uint8."""
-
-    def fingerprint(self) -> str:
-        """`source_fingerprint` of the pool's."""
-        return source_fingerprint(self._source)
 
     def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
         """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
@@ -75,30 +71,24 @@ def source_fingerprint(source: str) -> str:
     return digest.hexdigest()
 
 
-def check_source(source: str) -> None:
-    """Raise UserError for what is neither the name of a pool nor a folder with files of images."""
+def load_pool(source: str, seed: int) -> Tensor:
+    """Images to add: (P, 3, 100, 100) uint8, at most POOL.
+
+    Of PNG and JPEG files only those of the pool are decoded, however many there are.
+
+    Raises:
+        UserError: it is neither the name of a pool nor a folder with files of images.
+    """
+    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
     if source in _MADE:
-        return
+        return _MADE[source](rng)
     if not Path(source).is_dir():
         raise UserError(f"{source}: no such folder; name one with images or use --exogenous {TEXTURES}")
-    if not _files(Path(source)):
+    if not (files := _files(Path(source))):
         raise UserError(
             f"{source}: no readable image; name a folder with CIFAR-10's data_batch files (python or binary), with PNG "
             f"or JPEG files, or use --exogenous {TEXTURES}"
         )
-
-
-def load_pool(source: str, seed: int) -> Tensor:
-    """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
-    check_source(source)
-    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
-    if source in _MADE:
-        return _MADE[source](rng)
-    return _drawn(_files(Path(source)), rng)
-
-
-def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
-    """Images drawn from files, at most POOL; of PNG and JPEG files only those are decoded, however many there are."""
     batches = {path: _read_cifar(path) for path in files if _is_cifar(path)}
     ends = np.cumsum([len(batches[path]) if path in batches else 1 for path in files])
     drawn = rng.permutation(ends[-1])[:POOL]
@@ -112,15 +102,14 @@ def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
 
 
 def _textures(rng: np.random.Generator) -> Tensor:
-    """Pictures of discs."""
+    """Pictures of discs that cover each other, radii with density r^-3, colours around the image's own.
+
+    Edges and scales are those of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural images").
+    """
     return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
 
 
 def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
-    """(100, 100, 3) uint8: discs that cover each other, radii with density r^-3, colours around the image's own.
-
-    Edges and scales are those of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural images").
-    """
     own = rng.uniform(0, 255) + rng.normal(0, _CONTRAST / 2, 3)
     image = Image.new("RGB", (PICTURE_SIZE, PICTURE_SIZE), tuple(own.clip(0, 255).astype(int).tolist()))
     draw = ImageDraw.Draw(image)
