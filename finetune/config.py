@@ -59,7 +59,7 @@ class FinetuneConfig(StageConfig):
     eval_every: int = 50_000
     """Updates between evaluations; the final update is always evaluated."""
     eval_episodes: int = 10
-    """Episodes per evaluation."""
+    """Episodes per evaluation; 0: train only, as on data whose task has no environment here."""
     eval_clean: bool = True
     """Also run the final evaluation without corruption. It doubles that evaluation's time and changes nothing else."""
     eval_clean_episodes: int = 0
@@ -128,7 +128,7 @@ class FinetuneConfig(StageConfig):
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
-            view_seed=(0, MAX_SEED), shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
+            view_seed=(0, MAX_SEED), shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(0, MOST_EPISODES),
             eval_clean_episodes=(0, MOST_EPISODES), eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
 

@@ -75,8 +75,8 @@ class _Asked:
         dataset.require_transitions()
         self.encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
         refuse_outside(config, shift=(0, dataset.frame_size - 1))
-        remembers, decisions = self.encoder.memory is not None, TASKS.named(card.task).decisions
-        self.config = config = as_trained(config, card.end_to_end, remembers, decisions)
+        remembers = self.encoder.memory is not None
+        self.config = config = as_trained(config, card.end_to_end, remembers, _decisions(config, card.task))
         if isinstance(config.memory, HistoryOptions):
             self.encoder.config = replace(self.encoder.config, **config.memory.encoder_changes)
         if self.encoder.reads_state:
@@ -95,6 +95,14 @@ class _Asked:
         warn_of_other_code(self.config.encoder, vars(self.before), self.before.parts, what)
         self.dataset.to(self.device)
         return make_trainer(self.config, self.dataset, self.encoder.to(self.device), self.card, self.run)
+
+
+def _decisions(config: FinetuneConfig, task: str) -> int:
+    """Decisions in an evaluation episode; UserError for an unknown task if there are any."""
+    try:
+        return TASKS.named(task).decisions if config.eval_episodes else 0
+    except UserError as error:
+        raise UserError(f"{error}; `--eval-episodes 0` trains a policy without playing it") from error
 
 
 ALIKE = (

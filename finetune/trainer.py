@@ -152,8 +152,9 @@ def path_error(
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
-    """Write how well the first view predicts the simulator state. Needs stored states and an episode to hold out."""
-    if dataset.physics is None or dataset.task is None or dataset.num_episodes < 2:
+    """Write how well the first view predicts the simulator state, if the task is known, states are stored, and an
+    episode can be held out."""
+    if dataset.physics is None or dataset.task not in TASKS or dataset.num_episodes < 2:
         return
     if (run.path / PROBE_FILE).exists():
         tell_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
@@ -205,7 +206,8 @@ class FinetuneTrainer:
         if self.path_error:
             self.reference.with_path_error(self.path_error(self.algorithm.policy)).write(path)
         (path / FEATURES_FILE).unlink(missing_ok=True)
-        write_json(path / RENDER_FILE, render_info(self.card.task))
+        if self.config.eval_episodes:
+            write_json(path / RENDER_FILE, render_info(self.card.task))
         gamma = getattr(self.config.options, "gamma", None)
         critic = critic_of(read_metrics(path / METRICS_FILE), self.step, self.reference.mean_reward, gamma)
         write_json(path / CRITIC_FILE, critic)
@@ -230,6 +232,9 @@ class FinetuneTrainer:
             if isinstance(self.algorithm, EndToEnd):
                 loop.require_finite(self.algorithm.encoder)
                 save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
+            if not config.eval_episodes:
+                append_episodes(run.path / EPISODES_FILE, [])
+                return
             rows = [row for row in read_episodes(run.path / EPISODES_FILE) if row["step"] == self.step]
             played = Counter(row["evaluated_under"] for row in rows)
             if any(played[one.corruption] < episodes for one, episodes in under):

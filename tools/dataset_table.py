@@ -1,10 +1,10 @@
-"""Tabulate the sets that `data collect` makes: what their episodes return, and what collecting them costs.
+"""Tabulate the datasets of `data collect`: their episodes' returns, and the cost of collecting them.
 
     python tools/dataset_table.py --qualities random medium_replay medium medium_expert expert expert_noisy
 
-Returns are those of a full collection with the default seed: every episode is played by physics alone, from the same
-seed and with the same actions, so its rewards are the same to the digit. Cost is measured on a short collection with
-rendering, on one core. A set that the table has by the same actors is not played again.
+Returns are those of a full collection with the default seed. Episodes are played without rendering, with the same seeds
+and actions, so rewards are identical. Cost is measured on one core, on a short collection with rendering. Datasets that
+the table has with the same actors are not played again.
 """
 
 from __future__ import annotations
@@ -38,21 +38,23 @@ class Config:
     """Settings of the table."""
 
     out: Path = Path("results/datasets")
-    """Folder of returns.csv (a row an episode), costs.csv (a row a task), actors.json (hashes of the actors behind
-    each set) and sets.csv, the table."""
+    """Folder of returns.csv (one row per episode), costs.csv (one per task), actors.json (hashes of each dataset's
+    actors)
+        and the table, sets.csv.
+    """
     tasks: tuple[str, ...] = tuple(TASKS)
     qualities: tuple[str, ...] = tuple(SET_QUALITIES)
-    """One whose actor does not ship is left out."""
+    """Qualities; one whose actor is not shipped is left out."""
     episodes: int = 200
-    """Episodes of each set."""
+    """Episodes per dataset."""
     timed_episodes: int = 4
-    """Episodes of the short rendered collection that is timed for each task."""
+    """Episodes of the timed collection per task."""
     workers: int = 0
-    """Processes that play; 0 uses every core."""
+    """Worker processes; 0 uses every core."""
 
 
 def main(config: Config) -> None:
-    """Play and time what the table lacks, and write it again."""
+    """Measure what is missing, and write the table."""
     refuse_outside(config, episodes=(1, MOST_EPISODES), timed_episodes=(1, MOST_EPISODES), workers=0)
     for task, quality in product(config.tasks, config.qualities):
         TASKS.named(task)
@@ -81,7 +83,7 @@ def main(config: Config) -> None:
 
 
 def rows_of(path: Path) -> list[Row]:
-    """Rows of a table of before, none if there is none."""
+    """Rows of an existing table; empty if there is none."""
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as file:
@@ -89,7 +91,7 @@ def rows_of(path: Path) -> list[Row]:
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
-    """The table from the raw rows."""
+    """The table, from raw rows."""
     seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
     table = []
     for task, quality in product(dict.fromkeys(row["task"] for row in returns), SET_QUALITIES):
@@ -102,7 +104,7 @@ def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
 
 
 def cost(task: str, episodes: int) -> Row:
-    """Processor time of a short collection of random episodes, rendering and writing included, in this process."""
+    """CPU time of a short collection of random episodes in this process, including rendering and writing."""
     with tempfile.TemporaryDirectory() as folder:
         started = time.process_time()
         collect(CollectConfig(task, "random", Path(folder) / task, episodes, workers=1))

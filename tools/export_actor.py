@@ -1,9 +1,9 @@
-"""Choose the actors of a training run that `train_actor.py` made, and write them with their cards.
+"""Choose actors among the snapshots of a `train_actor.py` run, and export them with their cards.
 
 `python tools/export_actor.py RUN --out FOLDER`, also while the run continues. Expert: the best of the three best
-snapshots. Medium: of the three snapshots before it whose returns are nearest to half of the expert's, the nearest; all
-are judged on the same 20 episodes. Replay: a ladder of snapshots up to the medium one, which stands for the replay
-buffer behind medium_replay. FOLDER also gets the run's config, curve and networks, from which another run can start.
+snapshots. Medium: of the three earlier snapshots with returns closest to half of the expert's, the closest. Both are
+judged on the same 20 episodes. Replay: a ladder of snapshots up to the medium one, in place of the replay buffer behind
+medium_replay. FOLDER also gets the run's config, curve and networks, from which another run can start.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from vd4rl_pomdp.runs.files import write_bytes
 
 CARD_EPISODES = 20
 CARD_SEED = 10_000
-"""Episode i of an actor's card starts from environment seed CARD_SEED + i."""
+"""Episode i of an actor's card has environment seed CARD_SEED + i."""
 CURVE_COLUMNS = ("decisions", "return_mean")
 SETTINGS, CURVE, NETWORKS = "config.json", "curve.csv", "networks.safetensors"
 PROGRESS = (SETTINGS, CURVE, NETWORKS)
 """Files of a run from which another one can start."""
 LADDER_RUNGS = 15
-"""Snapshots in a ladder, at most: the actors of all tasks together stay under 10 MB."""
+"""Maximum snapshots in a ladder: the actors of all tasks together stay under 10 MB."""
 
 
 class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A task's states in, actions out; the task's limit of decisions truncates.
+    """A task on states; its limit of decisions truncates episodes.
 
     Observations: (D,) float32, dm_control's observations flattened in order. Actions: (A,) float32 in [-1, 1].
     """
@@ -51,13 +51,13 @@ class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (layout_of(task).action_dim,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """Begin the episode of a seed, or of one drawn from the environment's generator."""
+        """Start an episode from a seed, or from one drawn by the environment's generator."""
         super().reset(seed=seed)
         first = self._env.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
         return first.state, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Apply one action for the action repeat; the reward is the sum."""
+        """Repeat an action for the action repeat; the reward is the sum."""
         now = self._env.step(action)
         return now.state, now.reward, now.terminated, now.last and not now.terminated, {}
 
@@ -78,7 +78,7 @@ def episode_returns(actor: Actor, task: Task, episodes: int, first_seed: int = C
 
 
 def read_curve(run: Path) -> list[tuple[int, float]]:
-    """Learning curve of a run: (decisions, mean return) rows; empty before the first evaluation."""
+    """Learning curve of a run: rows (decisions, mean return); empty before the first evaluation."""
     if not (run / CURVE).exists():
         return []
     with (run / CURVE).open(newline="", encoding="utf-8") as file:
@@ -86,15 +86,15 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
 
 
 def snapshot_path(run: Path, decisions: int) -> Path:
-    """File of the actor that a run saved after so many decisions."""
+    """File of the snapshot after this many decisions."""
     return run / "snapshots" / f"{decisions:08d}.safetensors"
 
 
 def export_run(run: Path, out: Path) -> dict[str, Path]:
-    """Choose and write a run's actors, as the module says, and copy its progress; the run may still be going on.
+    """Choose and write a run's actors (see the module), and copy its progress; the run may still be training.
 
     Returns:
-        The files by quality: `expert`, `medium`, `replay`.
+        Files by quality: `expert`, `medium`, `replay`.
     """
     curve = read_curve(run)
     kept = [row for row in curve if snapshot_path(run, row[0]).exists()]
@@ -135,9 +135,9 @@ def _publish(
     returns: list[float],
     curve: list[tuple[int, float]],
 ) -> None:
-    """Write the actor with its card, and beside it the card with the learning curve.
+    """Write an actor with its card, and the card with the learning curve as a separate file.
 
-    Versions of what trained it are those that its snapshot names; of what played the returns, those of this process.
+    Training versions come from the snapshot, evaluation versions from this process.
     """
     here = {name: version(name) for name in ("dm-control", "mujoco", "numpy")}
     card = {
@@ -157,7 +157,7 @@ def _publish(
 
 
 def _ladder(run: Path, task: str, rows: list[tuple[int, float]]) -> Ladder:
-    """At most LADDER_RUNGS snapshots, evenly spread over the run up to the last of `rows`."""
+    """At most LADDER_RUNGS snapshots, evenly spaced up to the last of `rows`."""
     chosen = sorted({round(i) for i in np.linspace(0, len(rows) - 1, min(LADDER_RUNGS, len(rows)))})
     steps = [rows[i][0] for i in chosen]
     actors = [read_actor(snapshot_path(run, step)) for step in steps]
@@ -165,7 +165,7 @@ def _ladder(run: Path, task: str, rows: list[tuple[int, float]]) -> Ladder:
 
 
 def exported_actors(folder: Path, task: str) -> Iterator[tuple[int, Actor]]:
-    """Actors that `export_run` wrote into a folder, each after its decisions: first the ladder's, which are rounded."""
+    """Actors exported to a folder with their decisions: first the ladder's, which are rounded."""
     ladder = folder / f"{task}_replay.safetensors"
     if ladder.exists():
         read = read_ladder(ladder, task)
@@ -179,12 +179,12 @@ def exported_actors(folder: Path, task: str) -> Iterator[tuple[int, Actor]]:
 
 @dataclass(frozen=True)
 class Export:
-    """Choose a run's expert, medium and medium_replay actors, and write them with their cards."""
+    """Export a run's expert, medium and medium_replay actors with their cards."""
 
     run: tyro.conf.Positional[Path]
     """Folder of a training run."""
     out: Path
-    """Folder for the files."""
+    """Output folder."""
 
 
 def main(command: Export) -> None:

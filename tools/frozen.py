@@ -1,11 +1,11 @@
-"""Freeze what smoke runs compute, so that a refactor can be held against it, bit by bit, on one machine.
+"""Freeze the results of smoke runs, to check bit by bit on one machine that a refactor changes nothing.
 
-    python tools/frozen.py WORK              # compares with tools/frozen.json; exit code 1 where anything differs
-    python tools/frozen.py WORK --write      # freezes what this code computes
+    python tools/frozen.py WORK              # compares with tools/frozen.json; exit code 1 if anything differs
+    python tools/frozen.py WORK --write      # freezes the results of this code
 
-WORK is a folder for sets and runs; sets in it are kept for the next call. Each run is hashed by its losses, weights,
-probes and episodes: names and values, whatever the files are called. Only commands are called, no function of the
-packages, so that the same script runs before and after a move. Bits depend on the processor: freeze and compare on one.
+WORK is a folder for datasets and runs; datasets are reused by later calls. Each run is hashed by its losses, weights,
+probes and episodes: names and values, independent of file names. Only commands are called, not the packages' functions,
+so the same script works before and after code moves. Bits depend on the processor: freeze and compare on the same one.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ MAZES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a", "random", "su
 
 
 def call(*words: object) -> None:
-    """Do what the command line does; a refusal ends everything."""
+    """Run a command; an error ends everything."""
     main([str(word) for word in words])
 
 
 def losses(run: Path) -> list[object]:
-    """Rows of metrics: step, names and exact values."""
+    """Metrics rows: step, names and exact values."""
     return [sorted(json.loads(line).items()) for line in (run / "metrics.jsonl").read_text().splitlines()]
 
 
@@ -95,7 +95,7 @@ def weights(run: Path) -> list[object]:
 
 
 def episodes(run: Path) -> list[object]:
-    """What was played: step, seed, corruption, return and length."""
+    """Episodes: step, seed, corruption, return and length."""
     if not (run / "episodes.csv").exists():
         return []
     with (run / "episodes.csv").open(newline="") as file:
@@ -103,7 +103,7 @@ def episodes(run: Path) -> list[object]:
 
 
 def probes(run: Path) -> list[object]:
-    """Probe errors, and all numbers of a run on mazes."""
+    """Probe errors, and all numbers of a navigation run."""
     found: list[object] = []
     if (run / "probe.json").exists():
         found += sorted(json.loads((run / "probe.json").read_text()).items())
@@ -114,13 +114,13 @@ def probes(run: Path) -> list[object]:
 
 
 def fingerprint(run: Path) -> dict[str, str]:
-    """Short hashes of what a run computed."""
+    """Short hashes of a run's results."""
     parts = {"losses": losses(run), "weights": weights(run), "probes": probes(run), "episodes": episodes(run)}
     return {name: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16] for name, value in parts.items() if value}
 
 
 def collect(work: Path) -> None:
-    """The two sets, unless they are there."""
+    """Collect the two datasets, unless they exist."""
     if not (work / "walker_walk/expert_noisy").exists():
         out = work / "walker_walk/expert_noisy"
         call("data", "collect", "--task", "walker_walk", "--quality", "expert_noisy", "--episodes", 3, "--out", out)
@@ -130,7 +130,7 @@ def collect(work: Path) -> None:
 
 
 def runs(work: Path) -> dict[str, dict[str, str]]:
-    """Carry out all runs anew and hash them."""
+    """Repeat all runs and hash them."""
     shutil.rmtree(work / "runs", ignore_errors=True)
     found, data = {}, work / "walker_walk/expert_noisy"
     common = ["--preset", "smoke", "--data", data, "--device", "cpu"]

@@ -1,10 +1,10 @@
-"""Carry out results/ladder's grid, and keep what its page needs besides a run's last policy.
+"""Run results/ladder's grid, and keep every policy version and curve that its page needs.
 
     OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python tools/ladder.py --work DIR [--jobs 1] [--only ...]
-    python tools/ladder.py --work DIR --rows    # adds what is finished to results/ladder, at any time
+    python tools/ladder.py --work DIR --rows    # adds finished runs to results/ladder, at any time
 
-Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, taking finished rows from results/ladder. A fine-tuning
-overwrites its policy at each evaluation; every version is copied to DIR/snapshots, since the cloning loss on held-out
+Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, skipping runs with finished rows in results/ladder. A fine-tuning
+overwrites its policy at each evaluation, so every version is copied to DIR/snapshots: the cloning loss on held-out
 episodes is measured for each rung (`ladder_policies.py`). Re-run the same command to resume.
 """
 
@@ -24,9 +24,9 @@ _PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
 def keep_policies(runs: Path, snapshots: Path) -> None:
-    """Copy each policy that is not kept yet, under the update that it is of."""
+    """Copy each new policy version to a file named by its update."""
     for weights in runs.rglob("policy/model.safetensors"):
-        # opened once: a new version takes the place of this one, and does not change it
+        # an open file keeps its content when a new version replaces it
         with weights.open("rb") as file:
             header = file.read(int.from_bytes(file.read(8), "little"))
             step = json.loads(header)["__metadata__"]["step"]
@@ -40,7 +40,7 @@ def keep_policies(runs: Path, snapshots: Path) -> None:
 
 
 def keep_rows(runs: Path) -> int:
-    """Add finished runs to results/ladder, and the curves of their losses and critic values to its curves.csv."""
+    """Add finished runs to results/ladder, and their losses and critic values to its curves.csv."""
     code = subprocess.run([_PROGRAM, "results", "add", str(runs), "--out", str(RESULTS)]).returncode
     with (RESULTS / "curves.csv").open("w", newline="") as file:
         table = csv.DictWriter(file, ["run", "step", *CURVES], lineterminator="\n")
@@ -52,13 +52,13 @@ def keep_rows(runs: Path) -> int:
 
 
 def curve_of(metrics: Path) -> list[dict[str, str]]:
-    """Rows of curves.csv of a run's metrics.jsonl, each a mean over the updates since the row before."""
+    """Rows of curves.csv from a run's metrics.jsonl, each a mean over the updates since the previous row."""
     rows = [row for row in map(json.loads, metrics.read_text().splitlines()) if "q" in row]
     return [{"step": row["step"]} | {name: f"{row[name]:.5g}" for name in CURVES} for row in rows]
 
 
 def main() -> int:
-    """Run the sweep to its end, or keep what it has."""
+    """Run the sweep, or with --rows add finished runs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--work", type=Path, required=True, help="folder of runs, sets and snapshots")
     parser.add_argument("--jobs", default="1")
@@ -74,7 +74,7 @@ def main() -> int:
     sweep = subprocess.Popen(command)
     while True:
         ended = sweep.poll() is not None
-        keep_policies(args.work / "runs", args.work / "snapshots")  # once more at the end: of the last run, too
+        keep_policies(args.work / "runs", args.work / "snapshots")  # once more after the end, for the last run
         if ended:
             return sweep.returncode
         time.sleep(20)

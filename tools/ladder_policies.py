@@ -1,11 +1,11 @@
-"""Measure the policies that the ladder kept: cloning losses, or what means of them return.
+"""Evaluate the policies kept by `ladder.py`: cloning losses, or returns of weight averages.
 
     python tools/ladder_policies.py cloning --work DIR     # from the folder that the ladder was started in
     OMP_NUM_THREADS=1 python tools/ladder_policies.py averages --work DIR
 
-`cloning` adds to results/ladder/cloning.csv what it lacks, a row for every finished run and rung: losses on episodes of
-the run's own set and on held-out ones, which are collected once into DIR/held_out. `averages` adds to averaged.csv: at
-every second rung the weights of the rungs in the last half of the updates so far are averaged, and the mean policy
+`cloning` adds missing rows to results/ladder/cloning.csv, one per finished run and rung: losses on episodes of the
+run's own dataset and on held-out ones, which are collected once into DIR/held_out. `averages` adds to averaged.csv: at
+every second rung, the weights of the rungs in the last half of training so far are averaged, and the average policy
 plays the rung's episodes.
 """
 
@@ -41,25 +41,25 @@ from vd4rl_pomdp.runs.files import read_json, write_csv
 
 RESULTS = Path(__file__).parents[1] / "results" / "ladder"
 SEED = 10_000
-"""Collection seed of the held-out episodes: no training set has it."""
+"""Collection seed of the held-out episodes, used by no training set."""
 EPISODES = 20
-"""Held-out episodes, and episodes of a run's own set beside them, evenly spaced."""
+"""Held-out episodes, and as many evenly spaced episodes of a run's own dataset."""
 _PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
 @dataclass(frozen=True)
 class Config:
-    """Measure what a table of results/ladder lacks."""
+    """Add the missing rows to a table of results/ladder."""
 
     what: tyro.conf.Positional[Literal["cloning", "averages"]]
     work: Path
-    """Folder of runs, sets and snapshots; held-out episodes are collected there, too."""
+    """Folder of runs, datasets and snapshots; held-out episodes are collected there."""
     out: Path | None = None
     """The table; default: the one in results/ladder."""
 
 
 def main(config: Config) -> None:
-    """Measure run after run, and keep each at once."""
+    """Evaluate run by run, saving after each."""
     measure, file, columns, order = TABLES[config.what]
     out = config.out or RESULTS / file
     rows: list[dict[str, Any]] = list(csv.DictReader(out.open(newline=""))) if out.exists() else []
@@ -78,7 +78,7 @@ def main(config: Config) -> None:
 
 
 def cloning(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
-    """Update, loss on the run's own set and loss on held-out episodes, of a run's policies."""
+    """Update, loss on the run's own dataset and loss on held-out episodes, for a run's policies."""
     made = read_json(run / CONFIG_FILE)["collection"]
     held_out = work / "held_out" / made["task"] / made["quality"]
     if not (held_out / PROVENANCE).exists():
@@ -89,19 +89,19 @@ def cloning(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path)
 
 @torch.no_grad()
 def cloning_losses(run: Path, files: list[Path], data: Path | None) -> list[float]:
-    """Mean squared differences of the actions of a run's policies from a set's, over decisions and dimensions.
+    """Mean squared differences between policy actions and dataset actions, over decisions and dimensions.
 
-    The set is seen under the run's corruption, in a draw that it did not learn from, and unshifted, as it is played.
+    Observations have the run's corruption, drawn anew, and no shift, as in evaluation.
 
     Args:
         run: its folder, with the encoder.
-        files: of the policies.
-        data: the set; None: the run's own.
+        files: weights of the policies.
+        data: the dataset; None: the run's own.
     """
     config = read_json(run / CONFIG_FILE)["config"]
     record = read_json(run / "encoder" / CONFIG_FILE)
     told = record["encoder"]
-    if "gru_layers" in told:  # a folder that is older than a memory's own options
+    if "gru_layers" in told:  # folders from before memory options
         layers = told.pop("gru_layers")
         told["memory_options"] = {"gru_layers": layers} if told["history"] == "gru" else {}
     encoder = Encoder(EncoderConfig(**told))
@@ -122,7 +122,7 @@ def cloning_losses(run: Path, files: list[Path], data: Path | None) -> list[floa
 
 
 def averages(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
-    """Update, number of averaged rungs, episode and return, of the mean policies of a run that trains its encoder."""
+    """Update, number of averaged rungs, episode and return of a run's average policies, if its encoder is trained."""
     found: list[tuple[Any, ...]] = []
     labels, config = read_json(run / LABELS_FILE), read_json(run / CONFIG_FILE)["config"]
     for step in sorted(kept)[3::2] if labels["method"] != "random" else []:
@@ -150,7 +150,7 @@ TABLES = {
     "cloning": (cloning, "cloning.csv", ("run", "step", "trained_on", "held_out"), ("step",)),
     "averages": (averages, "averaged.csv", ("run", "step", "rungs", "episode", "return"), ("step", "episode")),
 }
-"""What is measured: by which function, the file, its columns, and what orders a run's rows."""
+"""By table: function, file, columns, and sort keys of a run's rows."""
 
 
 if __name__ == "__main__":

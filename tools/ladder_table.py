@@ -1,4 +1,4 @@
-"""The tables and the figure of results/ladder/README.md, and the budget that its rule gives, made from its rows.
+"""Make the tables and the figure of results/ladder/README.md, and the budget by its rule, from the rows there.
 
 python tools/ladder_table.py    # draws results/ladder/ladder.png and prints the budgets
 """
@@ -29,16 +29,16 @@ from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
 RESULTS = Path(__file__).parents[1] / "results" / "ladder"
 NEAR = 1.02
-"""A held-out cloning loss is near the lowest if it is no more than so many times it."""
+"""A held-out cloning loss counts as near the minimum up to this factor."""
 UNTRAINED = ("random", "state")
-"""Methods that train no encoder, which do not count for the rule."""
+"""Methods without a trained encoder, to which the rule does not apply."""
 FILES = {
     "curves.csv": {"q": "q", "bc_loss": "batches"},
     "cloning.csv": {"held_out": "held_out", "trained_on": "trained_on"},
 }
-"""Columns of the files beside a run's rows, and what a cell calls them."""
+"""By file, its columns and the attributes of `Cell` that hold them."""
 LOOKS = looks_of(())
-"""Numbers of looks by method."""
+"""Plot style by method."""
 LEVERS = {
     "": "-",
     "1,024 units": "--",
@@ -47,12 +47,12 @@ LEVERS = {
     "200 episodes": (0, (4, 1, 1, 1, 1, 1)),
     "16 views": (0, (1, 1)),
 }
-"""Dashes by what is not as in the first rungs."""
+"""Line dashes by the setting that differs from the base."""
 Look = dict[str, Any]
 
 
 class Key(NamedTuple):
-    """What tells a cell of the ladder from others."""
+    """Identifies a cell of the ladder."""
 
     task: str
     quality: str
@@ -61,19 +61,19 @@ class Key(NamedTuple):
     units: int
     precision: str
     steps: int
-    """Of pretraining."""
+    """Pretraining steps."""
     episodes: int
-    """Of the set."""
+    """Episodes of the dataset."""
     views: int
 
     @property
     def setting(self) -> str:
-        """Where it is trained, in words."""
+        """Task, quality and corruption in words."""
         return f"{self.task}, {self.quality}" + ", nothing hidden" * (self.corruption == "none")
 
     @property
     def lever(self) -> str:
-        """What is not as in the first rungs: 256 units, bf16, 3,000 steps, 100 episodes, 4 views."""
+        """Settings that differ from the base: 256 units, bf16, 3,000 steps, 100 episodes, 4 views."""
         levers = (
             (f"{self.units:,} units", self.units != 256),
             (self.precision, self.precision != "bf16"),
@@ -85,7 +85,7 @@ class Key(NamedTuple):
 
     @property
     def counts(self) -> bool:
-        """Whether the rule asks it: a trained encoder, and no lever pulled but the width."""
+        """Whether the rule applies: a trained encoder, and base settings except for the width."""
         return self.method not in UNTRAINED and self._replace(units=256).lever == ""
 
 
@@ -95,23 +95,23 @@ class Cell:
 
     key: Key
     q: Mapping[int, float]
-    """Mean value of the data's actions by update, each a mean over the updates since the one before."""
+    """Mean Q of the data's actions by update, each a mean since the previous row."""
     held_out: Mapping[int, float]
     """Cloning loss on held-out episodes by rung."""
     trained_on: Mapping[int, float] = field(default_factory=dict)
-    """The same on episodes of the set, in a draw of corruption that was not learned from."""
+    """Cloning loss on training episodes, with corruption drawn anew."""
     batches: Mapping[int, float] = field(default_factory=dict)
-    """The same on the batches of training, each a mean over the updates since the one before."""
+    """Cloning loss on training batches, each a mean since the previous row."""
     returns: Mapping[int, Mapping[int, float]] = field(default_factory=dict)
-    """Of the episodes of each rung by their seeds, played as trained."""
+    """By rung, return by episode seed, evaluated as trained."""
     clean: Sequence[float] = ()
-    """Of the last rung, played with nothing hidden."""
+    """Returns at the last rung without corruption."""
     data_return: float = float("nan")
     gamma: float = float("nan")
 
     @property
     def data_value(self) -> float:
-        """The data's own discounted return: their mean reward over 1 - gamma, as no episode ends but by its time."""
+        """The data's discounted return: mean reward / (1 - gamma), since only the time limit ends episodes."""
         return self.data_return / TASKS.named(self.key.task).decisions / (1 - self.gamma)
 
     def converged(self) -> list[int]:
@@ -120,9 +120,9 @@ class Cell:
 
 
 def drift(curve: Mapping[int, float], end: int) -> float:
-    """By which share of its value a critic moved over the last fifth of `end` updates, as if training had ended there.
+    """Relative change of a critic's value over the last fifth of `end` updates, as if training had ended there.
 
-    As `critic_of` tells it of a whole run; not a number where the curve has too few values for that.
+    As in `critic_of` for a whole run; NaN if the curve has too few values.
     """
     rows = [{"step": step, VALUE: value} for step, value in curve.items() if step <= end]
     moved = critic_of(rows, end, None, None).get("moved")
@@ -130,10 +130,9 @@ def drift(curve: Mapping[int, float], end: int) -> float:
 
 
 def budget(cells: Sequence[Cell]) -> int | None:
-    """The fewest updates, among the rungs of all cells, that suffice by a rule that looks at no evaluation.
+    """Smallest number of updates, among the rungs, that satisfies a rule without evaluations; None if there is none.
 
-    The critics of all cells have converged there, and in each the cloning loss on held-out episodes is within 2% of its
-    lowest over all such rungs. None: there is no such rung.
+    All critics have converged there, and each held-out cloning loss is within 2% of its minimum over all such rungs.
     """
     rungs = set.intersection(*(set(cell.converged()) for cell in cells)) if cells else set()
     lowest = [min((cell.held_out[rung] for rung in rungs), default=0.0) for cell in cells]
@@ -142,7 +141,7 @@ def budget(cells: Sequence[Cell]) -> int | None:
 
 
 def cells_in(folder: Path = RESULTS) -> list[Cell]:
-    """Finished runs of a results folder with its curves.csv and cloning.csv, in the order of the grid."""
+    """Finished runs of a results folder with its curves.csv and cloning.csv, in grid order."""
     known: defaultdict[str, dict[str, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
     for file, names in FILES.items():
         with (folder / file).open(newline="") as rows:
@@ -175,7 +174,7 @@ def _cell(run: Result, known: Mapping[str, dict[int, float]]) -> Cell:
 
 
 def asked() -> list[Key]:
-    """All cells of the ladder's grid, in its order."""
+    """All cells of the ladder's grid, in order."""
     keys = []
     for cell in load_grid(str(RESULTS / "grid.toml")).cells():
         made, before, after = collection_of(cell), recorded(cell, "pretrain"), recorded(cell, "finetune")
@@ -186,7 +185,7 @@ def asked() -> list[Key]:
 
 
 def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """A row for every run: where its returns peak and end, and what is known of them without an evaluation."""
+    """One row per run: where returns peak and end, and its diagnostics without evaluations."""
     yield (
         "| set (data's return) | policy | best rung: return (updates) | last rung: return (updates) | the same, played "
         "clean | critic converged at (updates) | its value at the end; the data's own | held-out cloning loss: lowest "
@@ -218,7 +217,7 @@ def _called(key: Key) -> str:
 
 
 def _spans(cell: Cell) -> str:
-    """Rungs at which the critic has converged, neighbours as one: "60,000 to 200,000"; a dash if there are none."""
+    """Rungs at which the critic has converged, as ranges ("60,000 to 200,000"); a dash if there are none."""
     rungs, there = sorted(cell.held_out), set(cell.converged())
     spans: list[list[int]] = []
     for before, rung in zip([0, *rungs], rungs, strict=False):
@@ -228,7 +227,7 @@ def _spans(cell: Cell) -> str:
 
 
 def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """Return, critic's value and cloning loss of every run by rung, and by how much `mik+a` is above `acro`."""
+    """Return, critic value and cloning loss of every run by rung, and the difference of `mik+a` and `acro`."""
     rungs = sorted({rung for cell in cells for rung in cell.returns})
     yield f"| set | policy | | {' | '.join(f'{rung:,}' for rung in rungs)} |"
     yield "|---|---|---|" + "---:|" * len(rungs)
@@ -253,13 +252,13 @@ def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
 
 
 def _less(one: Mapping[int, float], other: Mapping[int, float]) -> str:
-    """Mean of returns less that of others, and its standard error over the episodes' common starts."""
+    """Difference of mean returns, with its standard error over episodes paired by seed."""
     text = mean_and_error([one[seed] - other[seed] for seed in one])
     return text if text.startswith("-") else f"+{text}"
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """What the rule gives for each task and width, and which of its cells are not there yet."""
+    """The rule's budget by task and width, and the cells that are missing."""
     yield "| task | units | cells that count, of those asked for | updates by the rule | not run yet |"
     yield "|---|---:|---:|---:|---|"
     wanted: defaultdict[tuple[str, int], list[Key]] = defaultdict(list)
@@ -280,7 +279,7 @@ def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
 
 
 def figure(cells: Sequence[Cell]) -> Figure:
-    """A row of panels for every set and corruption: returns, the critic's value, and cloning losses by updates."""
+    """One row of panels per dataset and corruption: returns, critic values and cloning losses over updates."""
     panels: list[tuple[str, pd.DataFrame, Draw]] = []
     for task, quality, corruption in dict.fromkeys(cell.key[:3] for cell in cells):
         mine = [cell for cell in cells if cell.key[:3] == (task, quality, corruption)]
@@ -298,7 +297,7 @@ def _draw(draw: Callable[[Axes, Cell, Look], None], cells: Sequence[Cell], axes:
 
 
 def _draw_returns(axes: Axes, cell: Cell, look: Look) -> None:
-    """With standard errors over episodes."""
+    """Returns with standard errors over episodes."""
     rungs = np.array(sorted(cell.returns))
     means = np.array([np.mean(_of(cell, rung)) for rung in rungs])
     errors = np.array([np.std(_of(cell, rung), ddof=1) / len(_of(cell, rung)) ** 0.5 for rung in rungs])
@@ -307,7 +306,7 @@ def _draw_returns(axes: Axes, cell: Cell, look: Look) -> None:
 
 
 def _draw_critic(axes: Axes, cell: Cell, look: Look) -> None:
-    """Beside the data's own value; a dot at every rung at which it has converged."""
+    """Critic values, and the data's own; dots mark rungs at which the critic has converged."""
     steps = sorted(cell.q)
     marked = [steps.index(rung) for rung in cell.converged()]
     axes.plot(np.array(steps) / 1000, [cell.q[step] for step in steps], markevery=marked, **look)
@@ -315,7 +314,7 @@ def _draw_critic(axes: Axes, cell: Cell, look: Look) -> None:
 
 
 def _draw_losses(axes: Axes, cell: Cell, look: Look) -> None:
-    """On held-out episodes; fainter on those of the set, and faintest on the batches of training."""
+    """Cloning losses: on held-out episodes, fainter on training episodes, faintest on training batches."""
     unmarked = {"marker": None}
     for losses, faint in (
         (cell.held_out, {}), (cell.trained_on, {"alpha": 0.5} | unmarked), (cell.batches, {"alpha": 0.25} | unmarked)
@@ -327,16 +326,16 @@ def _draw_losses(axes: Axes, cell: Cell, look: Look) -> None:
 
 
 PANELS = {"return": _draw_returns, "critic": _draw_critic, "cloning loss": _draw_losses}
-"""What draws a run, by the panel's title."""
+"""Function that draws a run, by panel title."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Draw results/ladder/ladder.png and print the budgets; there is nothing to choose."""
+    """Draw results/ladder/ladder.png and print the budgets. No options."""
 
 
 def main(config: Config) -> None:
-    """See the config."""
+    """Write the figure and print the budgets."""
     cells = cells_in()
     figure(cells).savefig(RESULTS / "ladder.png", dpi=150)
     print("\n".join(budget_lines(cells)))

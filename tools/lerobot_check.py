@@ -1,11 +1,11 @@
-"""Hold `data import lerobot` and `data export lerobot` against LeRobot itself.
+"""Check `data import lerobot` and `data export lerobot` against LeRobot itself.
 
-    python -m venv WORK/venv && WORK/venv/bin/pip install lerobot==0.4.4      # 5 GB; torchcodec asks for Debian's
+    python -m venv WORK/venv && WORK/venv/bin/pip install lerobot==0.4.4      # 5 GB; torchcodec needs Debian's
     python tools/lerobot_check.py WORK                                        # libavdevice59, libavfilter8 and the like
 
-What is exported here is loaded by `LeRobotDataset` and compared value by value, with both of its video decoders, and
-goes through its own deletion of an episode; what `LeRobotDataset` records is imported here and compared. The tests
-hold both against pyarrow and av only, since LeRobot asks for other versions of torch. WORK must hold `venv` alone.
+An exported dataset is loaded by `LeRobotDataset`, with both of its video decoders, and compared value by value; LeRobot
+also deletes an episode of it. A dataset recorded by `LeRobotDataset` is imported and compared. The tests use only
+pyarrow and av, since LeRobot requires other versions of torch. WORK must contain only `venv`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vd4rl_pomdp.data.format import read_frames, read_rows, write_shard
 from vd4rl_pomdp.data.transfer import export_set, import_set
 
 STEPS = (30, 45, 12)
-"""Actions of the episodes."""
+"""Actions per episode."""
 
 THEIRS = """
 import json, sys
@@ -76,7 +76,7 @@ print(json.dumps(told))
 
 
 def main(work: Path) -> None:
-    """Write, let LeRobot read and write, read."""
+    """Export, let LeRobot read and record, import."""
     if {path.name for path in work.iterdir()} != {"venv"}:
         raise SystemExit(f"{work} must hold LeRobot's environment `venv` and nothing else")
     rng, episodes = np.random.default_rng(0), []
@@ -104,7 +104,7 @@ def main(work: Path) -> None:
     )
     for name, value in json.loads(done.stdout.splitlines()[-1]).items():
         print(f"{name}: {value}")
-    kept = rows["step_type"] != 2  # LeRobot records no picture after the last action
+    kept = rows["step_type"] != 2  # LeRobot records no frame after the last action
     for kind, camera in (("image", None), ("video", "observation.images.right")):
         shards = import_set("lerobot", str(work / f"theirs_{kind}"), work / f"back_{kind}", picture=camera)
         back = read_rows(shards[0])

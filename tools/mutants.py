@@ -1,9 +1,9 @@
-"""Put errors into a copy of the tree, one at a time, and see whether the test named for each fails.
+"""Mutation tests: insert errors into a copy of the tree, one at a time, and check that each one's test fails.
 
     python tools/mutants.py              all of tests/mutation/mutants.toml
     python tools/mutants.py iql k-means  those whose name or file contains one of these words
 
-First the named tests must pass without an error. Exit code 1 if one of them does not, or a mutant survives.
+The tests must pass without an error first. Exit code 1 if one of them fails, or if a mutant survives.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def load_mutants() -> list[dict[str, str]]:
 
 
 def mutated(mutant: dict[str, str], tree: Path) -> str:
-    """Text of a mutant's file with its error; raises ValueError if the old text is not there exactly once."""
+    """Text of a mutant's file with its error; ValueError unless the old text occurs exactly once."""
     text = (tree / mutant["file"]).read_text(encoding="utf-8")
     if (count := text.count(mutant["old"])) != 1:
         raise ValueError(f"{mutant['name']}: its old text is in {mutant['file']} {count} times, not once")
@@ -36,7 +36,7 @@ def mutated(mutant: dict[str, str], tree: Path) -> str:
 
 
 def copy_tree(target: Path) -> None:
-    """Copy all files of the checkout but those that git ignores."""
+    """Copy all files of the checkout that git does not ignore."""
     words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     for name in subprocess.run(words, cwd=ROOT, capture_output=True, check=True, text=True).stdout.split("\0"):
         if name and (ROOT / name).is_file():
@@ -45,7 +45,7 @@ def copy_tree(target: Path) -> None:
 
 
 def run_tests(tree: Path, tests: list[str]) -> int:
-    """Pytest's exit code, which tests that take too long have none of."""
+    """Pytest's exit code; a timeout counts as a failure."""
     env = os.environ | {"PYTHONPATH": str(tree), "VD4RL_POMDP_CACHE": f"{tree}-cache"}
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"--basetemp={tree}-tests", *tests]
     with suppress(subprocess.TimeoutExpired), open(f"{tree}.log", "a") as log:
@@ -54,7 +54,7 @@ def run_tests(tree: Path, tests: list[str]) -> int:
 
 
 def main() -> int:
-    """Try the mutants that the words choose."""
+    """Run the mutants selected on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("words", nargs="*", default=[""], help="parts of names or files; none: all mutants")
     words = [word.lower() for word in parser.parse_args().words]

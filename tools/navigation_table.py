@@ -1,4 +1,4 @@
-"""The tables of the pages in results/navigation, made from its rows."""
+"""Make the tables of the pages in results/navigation from the rows there."""
 
 from __future__ import annotations
 
@@ -25,69 +25,69 @@ from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_ru
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
 REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
-"""In percent, on held-out trajectories."""
+"""Errors in percent, on held-out trajectories."""
 PAPERS_WAY = [online_error(component).raw() for component in ("state", "position", "velocity")]
 MEASURES = (*PAPERS_WAY, *REFITTED)
-"""Of a maze's table: the paper's way and units, then percent by the refitted probe."""
+"""Columns of a maze's table: the paper's protocol and units, then percent by the refitted probe."""
 REFERENCES = {
     UNTRAINED: "untrained",
     "supervised+a": "`supervised+a`",
     "supervised": "`supervised`",
     "supervised_picture": "`supervised_picture`",
 }
-"""Methods that no objective trains, as the pages call them."""
+"""Names of the reference methods on the pages."""
 HARD = ("hard_no_curtain", "hard_one_curtain", "hard_three_curtains", "hard_first_person")
 STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
-"""Pictures other than the preset's, as the pages call them."""
+"""Names of observation formats other than the preset's on the pages."""
 TRAINING_LOSS = Measure("action_loss", "training", "")
-"""As the paper's tables have it."""
+"""The action loss of the paper's tables."""
 LONGER = "budget"
-"""The folder of runs of 20,000 steps."""
+"""Folder of the runs with 20,000 steps."""
 _ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
 
 
 def main_runs() -> list[NavigationRun]:
-    """The runs of results/navigation, without those of folders within it."""
+    """Runs of results/navigation itself, without subfolders."""
     return load_runs(read_results(RESULTS))
 
 
 def numbers_in(folder: str = ".") -> Numbers:
-    """Numbers of the runs of results/navigation, or of a folder within it; none where no run was kept yet."""
+    """Numbers of the runs of results/navigation, or of a subfolder; empty if it has no runs."""
     place = RESULTS / folder
     return numbers_of(frame_of(load_runs(read_results(place)))) if (place / RUNS).exists() else {}
 
 
 def values(numbers: Numbers, condition: Condition, measure: Measure) -> list[float]:
-    """One number a seed, in order."""
+    """One number per seed, in order."""
     return list(numbers.get((*condition, *measure), {}).values())
 
 
 def _mean(numbers: Numbers, condition: Condition, measure: Measure) -> str:
-    """Mean and standard error over seeds; a dash if there is no seed."""
+    """Mean and standard error over seeds; a dash if there are none."""
     found = values(numbers, condition, measure)
     return mean_and_error(found, 1) if found else "–"
 
 
 def _cell(numbers: Numbers, condition: Condition, measure: Measure) -> str:
-    """Mean and standard error over seeds, and the paper's number; a dash if there is no seed."""
+    """Mean and standard error over seeds, and the paper's number; a dash if there are none."""
     paper = paper_number(condition, measure) if values(numbers, condition, measure) else None
     return _mean(numbers, condition, measure) + ("" if paper is None else f" ({paper:.1f})")
 
 
 def _called(method: str) -> str:
-    """A method's name, or what the pages call a reference."""
+    """Name of a method on the pages."""
     return REFERENCES.get(method, f"`{method}`")
 
 
 def _head(columns: Sequence[str]) -> Iterator[str]:
-    """A table's first two lines; its first column, which names the rows, has no title."""
+    """A table's first two lines; the column of row names has no title."""
     yield f"| | {' | '.join(columns)} |"
     yield "|---|" + "---:|" * len(columns)
 
 
 def maze_lines(numbers: Numbers, maze: str) -> Iterator[str]:
-    """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
+    """All methods at K = 15 in one maze by increasing state error, then the references."""
     yield from _head(("seeds", "state", "position", "velocity", "state, position, velocity in %"))
     ranked = sorted(OBJECTIVES, key=lambda name: np.mean(values(numbers, Condition(maze, name), MEASURES[0])))
     for method in (*ranked, *REFERENCES):
@@ -98,7 +98,7 @@ def maze_lines(numbers: Numbers, maze: str) -> Iterator[str]:
 
 
 def _measured(numbers: Numbers) -> list[str]:
-    """The paper's own mazes in which every objective was trained at K = 15."""
+    """The paper's mazes in which every objective was trained at K = 15."""
     return [
         maze for maze in PAPER_MAZES if all(values(numbers, Condition(maze, name), MEASURES[0]) for name in OBJECTIVES)
     ]
@@ -113,14 +113,14 @@ def state_lines(numbers: Numbers, ks: Sequence[int]) -> Iterator[str]:
 
 
 def texture_lines(numbers: Numbers) -> Iterator[str]:
-    """State errors at K = 15 with textures in the pictures."""
+    """State errors at K = 15 with textures as exogenous noise."""
     yield from _head(["seeds", *(f"`{name}`" for name in _ORDER)])
     for maze in _measured(numbers):
         yield from _state_lines(numbers, "textures", Condition(maze, "", exogenous=True))
 
 
 def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
-    """State errors and action losses under three curtains after 2,500 and after 20,000 steps."""
+    """State errors and action losses with three curtains after 2,500 and after 20,000 steps."""
     told = [(words, steps) for words in ("state error", "action loss") for steps in ("2,500", "20,000")]
     yield from _head(["seeds", *(f"{words}, {steps} steps" for words, steps in told)])
     for method, k in (("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)):
@@ -132,9 +132,10 @@ def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
 
 
 def _state_lines(numbers: Numbers, words: str, cell: Condition) -> Iterator[str]:
-    """State errors of all objectives under a condition, in the paper's way and units, then in percent when refitted.
+    """State errors of all objectives under a condition: the paper's protocol and units, then percent by the refitted
+    probe.
 
-    The condition's method is left open; no line if none was trained.
+        The condition's method is ignored; no line if no method was trained.
     """
     for told, measure in ((words, MEASURES[0]), (f"{words}, in %", REFITTED[0])):
         conditions = [cell._replace(method=name) for name in _ORDER]
@@ -146,7 +147,7 @@ def _state_lines(numbers: Numbers, words: str, cell: Condition) -> Iterator[str]
 
 
 def first_person_lines(numbers: Numbers) -> Iterator[str]:
-    """Errors under the compass of all that was trained there, those with the smallest state errors first."""
+    """Errors of everything trained under the compass, by increasing state error."""
     beside = "probe beside the model: position, velocity"
     yield from _head(("seeds", "state, position, velocity", beside))
     told = {
@@ -172,7 +173,7 @@ def first_rung_lines(numbers: Numbers) -> Iterator[str]:
 
 
 def picture_lines(usual: Numbers) -> Iterator[str]:
-    """Errors of position and velocity under the stars by what is changed, below those of the preset.
+    """Errors of position and velocity under the stars, for the preset and then by changed setting.
 
     Each changed setting has one seed; `usual` are numbers of the preset.
     """
@@ -190,12 +191,12 @@ def picture_lines(usual: Numbers) -> Iterator[str]:
 
 
 def _place_and_speed(numbers: Numbers, condition: Condition) -> str:
-    """Errors of position and velocity by the refitted probe, in percent."""
+    """Position and velocity errors of the refitted probe, in percent."""
     return ", ".join(_mean(numbers, condition, error) for error in REFITTED[1:])
 
 
 def hard_lines(numbers: Numbers) -> Iterator[str]:
-    """Errors of position and velocity at K = 15 in the harder mazes."""
+    """Position and velocity errors at K = 15 in the harder mazes."""
     yield from _head([f"`{maze}`" for maze in HARD])
     for method in (*_ORDER, *REFERENCES):
         conditions = [Condition(maze, method) for maze in HARD]

@@ -1,4 +1,4 @@
-"""The tables of results/offline, results/control and results/methods/README.md, made from the rows of these folders."""
+"""Make the tables of results/offline, results/control and results/methods/README.md from the rows there."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
 HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
 ALONE = ", patches alone"
-"""What is added to the name of a set where no frames were zeroed."""
+"""Suffix of a dataset's name for patches without zeroed frames."""
 UNTRAINED = "random"
 SETS = {
     ("walker_walk", "expert_noisy"): "walker_walk, noisy expert",
@@ -44,11 +44,11 @@ SETS = {
     ("cheetah_run", "expert"): "cheetah_run, expert",
     ("cheetah_run", "medium_expert"): "cheetah_run, medium_expert",
 }
-"""What the table of returns calls a set."""
+"""Names of datasets in the table of returns."""
 MAIN = (UNTRAINED, "acro", "mik", "mik+a")
-"""Methods of the table of returns and of the aggregates."""
+"""Methods in the table of returns and in the aggregates."""
 EXPLORATORY = ("expert_noisy", "medium_noisy")
-"""Qualities that were chosen after looking at first returns."""
+"""Qualities chosen after looking at first returns."""
 CONTRASTS = {
     "a memory: `mik` less `acro`": ("mik", "acro"),
     "past actions: `mik+a` less `mik`": ("mik+a", "mik"),
@@ -56,25 +56,25 @@ CONTRASTS = {
 }
 """The paper's claims, as differences of returns."""
 CORRUPTIONS = {"patch+zero_frames": "patches and frames", "none": "nothing"}
-"""What is hidden, as the table of methods calls it, in the order of its columns."""
+"""Names of corruptions in the table of methods, in column order."""
 ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
-"""Policies that were played with nothing hidden after their runs had ended."""
+"""Clean evaluations of policies, made after their runs had ended."""
 
 
 def main_runs() -> list[Run]:
-    """Finished TD3+BC of the grids offline and control, without variants."""
+    """Finished TD3+BC runs of the grids offline and control, without variants."""
     return [run for run in runs_of(GRIDS, GRIDS) if not run.variant]
 
 
 def runs_of(grids: Sequence[str], folders: Sequence[str]) -> list[Run]:
-    """Finished fine-tunings of grids, in folders of results: other grids have some of their cells."""
+    """Finished fine-tuning runs of some grids, from results folders, since grids share cells."""
     cells = [cell for name in grids for cell in load_grid(name).cells()]
     found = load_runs([RESULTS / name for name in folders], choice=GridMembers(" and ".join(grids), cells))
     return [run for run in found if run.rows and run.finished]
 
 
 def return_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """Returns of the main methods, a row for every set and corruption."""
+    """Returns of the main methods, one row per dataset and corruption."""
     shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
     yield f"| set (data's return) | {' | '.join(shown)} | `acro` trained with nothing hidden |"
     yield "|---|" + "---:|" * (len(shown) + 1)
@@ -88,7 +88,7 @@ def return_lines(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """The paper's claims as differences with intervals, on every set, as trained and played with nothing hidden."""
+    """The paper's claims as differences with intervals on every dataset, evaluated as trained and clean."""
     yield f"| set | played | {' | '.join(CONTRASTS)} | `mik+a` less the best other |"
     yield "|---|---|" + "---:|" * (len(CONTRASTS) + 1)
     for *place, corruption in measured_sets(runs):
@@ -103,7 +103,7 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def _best_other(runs: Sequence[Run], corruption: str) -> str:
-    """The method with two seeds or more that returns most, but for `mik+a`, references and those told the states."""
+    """The best method with at least two seeds, without `mik+a`, references and methods trained on states."""
     here = [run for run in runs if run.labels["corruption"] == corruption]
     methods = {run.method for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
     known = {method: _of(here, method, corruption) for method in methods}
@@ -111,7 +111,7 @@ def _best_other(runs: Sequence[Run], corruption: str) -> str:
 
 
 def _less(runs: Sequence[Run], corruption: str, method: str, other: str, clean: bool) -> str:
-    """Mean return of a method less that of another, and its interval; a dash where one of them was not played so."""
+    """Difference of two methods' mean returns with its interval; a dash if either was not evaluated so."""
     one, two = (_episodes(_of(runs, name, corruption), clean) for name in (method, other))
     if one is None or two is None:
         return number(None)
@@ -120,7 +120,7 @@ def _less(runs: Sequence[Run], corruption: str, method: str, other: str, clean: 
 
 
 def _episodes(runs: list[Run], clean: bool) -> np.ndarray | None:
-    """Returns of runs, (n, episodes); None where a policy was not played with nothing hidden."""
+    """Returns of runs, (n, episodes); None if a policy lacks the clean evaluation."""
     if not clean:
         return episodes_of(runs) if runs else None
     if runs and all(run.last_clean for run in runs):
@@ -132,7 +132,7 @@ def _episodes(runs: list[Run], clean: bool) -> np.ndarray | None:
 
 
 def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """The report's statistics over sets, of the methods that all of them have."""
+    """The report's statistics over datasets, for methods that all of them have."""
     yield "| sets | method | interquartile mean | mean | chance that `mik+a` ends above it |"
     yield "|---|---|---:|---:|---:|"
     shown = [
@@ -159,19 +159,19 @@ def _kind(run: Run) -> tuple[bool, str]:
 
 
 def measured_sets(runs: Sequence[Run]) -> Iterator[tuple[str, str, str]]:
-    """Task, quality and corruption of which the pages tell and of which anything is there."""
+    """Task, quality and corruption of the pages' datasets with results."""
     measured = {(*_place(run), run.labels["corruption"]) for run in runs}
     asked = ((*place, corruption) for corruption, place in product((HIDDEN, PATCHES), SETS))
     return (one for one in asked if one in measured)
 
 
 def table_name(task: str, quality: str, corruption: str) -> str:
-    """What the table of a set is called."""
+    """Name of a dataset's table."""
     return f"{task}, {quality}" + ALONE * (corruption == PATCHES)
 
 
 def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """What has to hold on a set before methods are ranked on it."""
+    """Conditions that a dataset must meet before methods are ranked on it."""
     yield (
         "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | its bar (published score) |"
         " best of it | best less `random` | passed |"
@@ -188,11 +188,11 @@ def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """How well what is known of a policy orders the returns on a set, with and without untrained encoders."""
+    """Rank correlation of policy diagnostics with returns on each dataset, with and without untrained encoders."""
     yield "| set | passed | runs | " + " | ".join(GOING_WITH.values()) + " |"
     yield "|---|---|---:|" + "---:|" * len(GOING_WITH)
     table = runs_frame(runs)
-    table = table[table[PROBES[0]].notna() & ~table["method"].isin(TOLD_STATES)]  # with a probe that is held out
+    table = table[table[PROBES[0]].notna() & ~table["method"].isin(TOLD_STATES)]  # with a held-out probe
     for row in _judged(runs):
         places = ["task", "quality", "corruption"]
         probed = table[(table[places] == [row[name] for name in places]).all(axis=1)]
@@ -202,7 +202,7 @@ def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def _judged(runs: Sequence[Run]) -> Iterator[Row]:
-    """Gates of the sets that pages tell of, by their `name`s there, and whether they are `passed`."""
+    """Gates of the pages' datasets, by their `name`s there, and whether they are `passed`."""
     for row in gates(list(runs)):
         place = row["task"], row["quality"]
         if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
@@ -211,9 +211,9 @@ def _judged(runs: Sequence[Run]) -> Iterator[Row]:
 
 
 def _rank_correlation(table: pd.DataFrame, error: str) -> str:
-    """Spearman's, of an error and the return over runs: -1 where the one that errs less always returns more.
+    """Spearman correlation of an error and the return over runs: -1 if a smaller error always has a larger return.
 
-    A dash for a single run, which has no order, and where a run does not know its error.
+    A dash for a single run, or if a run lacks the error.
     """
     if len(table) < 2 or table[error].isna().any():
         return number(None)
@@ -224,7 +224,7 @@ GOING_WITH = {
     **dict(zip(PROBES, ("probe of the pose", "probe of the velocity"), strict=True)),
     **dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
 }
-"""Errors that returns may go with, by their columns in the frame of runs."""
+"""Errors to correlate with returns, by column of the frame of runs."""
 
 
 def _place(run: Run) -> tuple[str, str]:
@@ -238,7 +238,7 @@ def _of(runs: Sequence[Run], method: str, corruption: str) -> list[Run]:
 
 
 def _told(runs: list[Run]) -> str:
-    """Mean return and its interval, and how many seeds if fewer than three; a dash if there is none."""
+    """Mean return with interval, and the number of seeds if below three; a dash if there is none."""
     if not runs:
         return number(None)
     returns = episodes_of(runs)
@@ -247,7 +247,7 @@ def _told(runs: list[Run]) -> str:
 
 
 def method_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """A row for every method, those that return most where patches and frames are hidden first."""
+    """One row per method, by decreasing return under patches and zeroed frames."""
     told = "hidden: return (episodes) | probe: pose, velocity"
     yield f"| | {' | '.join(f'{words} {told}' for words in CORRUPTIONS.values())} |"
     yield "|---|---:|---:|---:|---:|"
@@ -258,7 +258,7 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
 
 
 def _rank_of(cells: dict[tuple[str, str], Run], method: str) -> tuple[float, ...]:
-    """Returns by corruption; what was not trained under it comes last."""
+    """Sort key: returns by corruption; missing ones come last."""
     mine = (cells.get((method, hidden)) for hidden in CORRUPTIONS)
     return tuple(returns_of([run]).item() if run else -1.0 for run in mine)
 

@@ -1,9 +1,8 @@
-"""Write the tables of results that are made from committed rows into their pages.
+"""Write the tables made from committed rows into their pages.
 
     python tools/page_tables.py
 
-A table lies under a line `<!-- table: NAME -->` of its page, up to the next line that is none of it. A test holds the
-pages against what this writes.
+A table follows a line `<!-- table: NAME -->` of its page. A test checks that the pages are up to date.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ ROOT = Path(__file__).parents[1]
 MARK = "<!-- table: {} -->"
 """The line above a table."""
 Tables = dict[str, Iterable[str]]
-"""Lines of tables, by their names."""
+"""Lines of tables by name."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Write the tables that are made from committed rows into their pages; there is nothing to choose."""
+    """Write the tables made from committed rows into their pages. No options."""
 
 
 def pages() -> dict[str, Tables]:
-    """Tables of each page, which is told by its path in the repository."""
+    """Tables of each page, by the page's path in the repository."""
     methods = offline_table.runs_of(["methods"], ["methods", "offline", "control"])
     returns, mazes, rungs = offline_table.main_runs(), navigation_table.numbers_in(), ladder_table.cells_in()
     return {
@@ -71,10 +70,10 @@ def pages() -> dict[str, Tables]:
 
 
 def with_tables(text: str, tables: Tables, page: str) -> str:
-    """A page's text with its tables under their marks.
+    """A page's text with its tables filled in.
 
     Raises:
-        UserError: If a table has no mark on the page, or several.
+        UserError: a table's mark is missing, or occurs several times.
     """
     lines = text.split("\n")
     for name, table in tables.items():

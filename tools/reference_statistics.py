@@ -1,9 +1,9 @@
-"""Statistics of some scores by rliable 1.2.0, an independent implementation that the tests compare this package with.
+"""Statistics of some scores by rliable 1.2.0, an independent implementation to test this package against.
 
     python -m venv scratch && scratch/bin/pip install rliable==1.2.0 "pandas<3"
     scratch/bin/python tools/reference_statistics.py > tests/report/rliable.json
 
-rliable ignores its seed, so its intervals are of enough bootstrap samples to repeat to some 0.0005.
+rliable ignores its seed, so there are enough bootstrap samples for intervals to repeat to about 0.0005.
 """
 
 import json
@@ -15,11 +15,11 @@ from rliable import library, metrics
 REPLICATES = 200_000
 TASKS, SEEDS = 4, 8
 THRESHOLDS = np.linspace(0, 1, 11)
-"""The number of runs is a multiple of four, where rliable's interquartile mean, scipy's trimmed mean, is ours."""
+"""The number of runs is a multiple of four, where rliable's interquartile mean (scipy's trimmed mean) equals ours."""
 
 
 def main() -> None:
-    """Print scores and what rliable says of them, as JSON."""
+    """Print scores and rliable's statistics as JSON."""
     rng = np.random.default_rng(0)
     level = rng.uniform(0.2, 0.9, TASKS)
     scores = {
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def _aggregates(scores: np.ndarray) -> dict[str, list[float]]:
-    """For each statistic of (seeds, tasks) scores: its value, and the ends of its interval."""
+    """For each statistic of (seeds, tasks) scores: its value and interval."""
 
     def all_of(values: np.ndarray) -> np.ndarray:
         return np.array(

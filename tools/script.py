@@ -1,4 +1,4 @@
-"""What the measuring scripts share: a command line from a config class, and a user's slip told in one line."""
+"""Entry point of the measuring scripts: a command line from a config class, with one-line errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Config = TypeVar("Config")
 
 
 def run_script(main: Callable[[Config], None], config: type[Config]) -> None:
-    """Do `main` by the command line; a UserError ends it in one line and exit code 2."""
+    """Run `main` with the command line's config; a UserError exits with one line and code 2."""
     try:
         main(tyro.cli(config))
     except UserError as error:

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Set up what `make demo` and `make test` need: a virtual environment with the package, and software rendering.
-# With the word `tests`, also Slurm, which the tests of sweeps start. A second run finds its stamp and does nothing.
-# PYTHON=python3.12 chooses the interpreter: an environment of another version is made anew. Without it an environment
-# keeps its own.
+# With the argument `tests`, also Slurm, for the sweep tests. A second run finds its stamp and does nothing.
+# PYTHON=python3.12 chooses the interpreter; an environment with another version is rebuilt. By default, an existing
+# environment keeps its version.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -35,7 +35,7 @@ install_debian() {
     $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null
 }
 
-# The tests of sweeps start a Slurm of their own, as root; where it cannot be installed they are skipped.
+# The sweep tests start their own Slurm, as root; they are skipped if it cannot be installed.
 install_slurm() {
     if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null && ! command -v slurmd >/dev/null; then
         (install_debian --no-install-recommends slurmctld slurmd slurm-client munge) 2>/dev/null || say "setup: no Slurm"
@@ -64,7 +64,7 @@ fi
 say "setup: installing Python packages (a few minutes the first time)"
 pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
 pip_install -e ".[dev,navigation,policy,tracking,slurm,ray]"
-pip_install --no-deps dm-control # which Python 3.13 gets no other way; elsewhere it is there already
+pip_install --no-deps dm-control # on Python 3.13 only this works; elsewhere it is installed already
 
 # Whether a task can be rendered here.
 can_render() {

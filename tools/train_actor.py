@@ -1,11 +1,11 @@
-"""Train the actors that collect data: soft actor-critic on simulator states (SBX), for each task by its own recipe.
+"""Train the actors that collect data: soft actor-critic on simulator states (SBX), with a recipe per task.
 
 `python tools/train_actor.py humanoid_walk --out RUN`, with the extra `policy`; re-run the same command to resume.
-`python tools/train_actor.py my_task.py my_task --out RUN` first runs a file, which registers a task of one's own.
+`python tools/train_actor.py my_task.py my_task --out RUN` first runs a file that registers a user's own task.
 
-RUN keeps `snapshots/` (an actor every `eval_every` decisions), `curve.csv` (its mean return), `checkpoint.safetensors`
-(networks, optimisers, replay buffer) and `networks.safetensors` (what another machine can start from, small enough for
-a repository). At the end, the chosen actors are written beside them (see `export_actor`).
+RUN holds `snapshots/` (an actor every `eval_every` decisions), `curve.csv` (mean returns), `checkpoint.safetensors`
+(networks, optimisers, replay buffer) and `networks.safetensors` (small; another machine can start from it). At the end,
+the chosen actors are exported there (see `export_actor`).
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ CHECKPOINT = "checkpoint.safetensors"
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 STATISTICS = ("mean", "var", "count")
 DECISIONS_A_ROUND = 4
-"""Decisions between two rounds of updates, or one for each environment if those are more."""
+"""Decisions between rounds of updates; at least one per environment."""
 RANDOM_DECISIONS = 1_000
-"""Uniformly random decisions that a new run begins with, times its environments (ten at most)."""
+"""Uniformly random decisions at the start of a new run, times its environments (at most ten)."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,15 @@ class PolicyConfig:
     out: Path
     """Run folder; re-run the same command to resume."""
     decisions: int = 300_000
-    """Environment decisions in all."""
+    """Total environment decisions."""
     seed: int = 0
-    """Seed of the networks, the replay draws and the training episodes."""
+    """Seed of the networks, the replay sampling and the training episodes."""
     learning_rate: float = 7e-4
-    """Adam's learning rate, for actor and critics."""
+    """Adam's learning rate for actor and critics."""
     network: Literal["mlp", "simba"] = "mlp"
     """mlp: two hidden layers; simba: one residual block with layer norms (arXiv 2410.09754)."""
     hidden: int = 256
-    """Units of a hidden layer, or width of the residual stream."""
+    """Hidden units, or width of the residual stream."""
     critic_norm: bool = False
     """Layer norm after each hidden layer of an mlp's critics."""
     normalise: bool = False
@@ -82,31 +82,31 @@ class PolicyConfig:
     n_step: int = 1
     """Steps of the critics' returns."""
     envs: int = 1
-    """Environments that take turns with the updates."""
+    """Vectorised environments."""
     updates_per_decision: float = 1.0
-    """Gradient steps for each decision."""
+    """Gradient steps per decision."""
     batch_size: int = 256
-    """Transitions in a gradient step."""
+    """Transitions per gradient step."""
     temperature: float = 1.0
-    """Initial weight of the entropy."""
+    """Initial entropy temperature."""
     temperature_rate: float = 7e-4
-    """Adam's learning rate for that weight."""
+    """Adam's learning rate for the temperature."""
     target_entropy: float = -1.0
-    """Entropy per action dimension that the temperature aims at."""
+    """Target entropy per action dimension."""
     replay_size: int = 1_000_000
-    """Transitions kept for the updates."""
+    """Capacity of the replay buffer in transitions."""
     eval_every: int = 5_000
-    """Decisions between two snapshots."""
+    """Decisions between snapshots."""
     eval_episodes: int = 5
-    """Episodes behind each point of the learning curve."""
+    """Evaluation episodes per point of the learning curve."""
     stop_at: float = 1000.0
-    """End early once a snapshot's mean return reaches this."""
+    """Stop early once a snapshot's mean return reaches this."""
     start_from: Path | None = None
-    """Begin a new run where another one stood: a folder with its config.json, curve.csv and networks.safetensors."""
+    """Start from another run: a folder with its config.json, curve.csv and networks.safetensors."""
     refill: int = 100_000
-    """After --start-from: decisions of the old policy that fill the empty replay before the first update."""
+    """After --start-from: decisions of the old policy that fill the replay buffer before the first update."""
     critic_warmup: int = 20_000
-    """After --start-from: updates of the critics alone, before the actor learns on."""
+    """After --start-from: updates of the critics alone, before the actor is trained."""
 
 
 _STEADY = PolicyConfig(
@@ -119,9 +119,9 @@ _STEADY = PolicyConfig(
     temperature_rate=1e-4,
     target_entropy=-0.5,
 )
-"""What all tasks but walker_walk share."""
+"""Settings of all tasks but walker_walk."""
 _GENERAL = replace(_STEADY, decisions=600_000, envs=4, temperature=0.1, replay_size=800_000, eval_every=4_000)
-"""What a task without a recipe of its own gets: cheetah_run's."""
+"""Settings of a task without a recipe: cheetah_run's."""
 _SMALL = replace(_GENERAL, decisions=60_000, hidden=64, replay_size=100_000, eval_every=500, eval_episodes=2)
 RECIPES: dict[str, PolicyConfig] = {
     "walker_walk": PolicyConfig("walker_walk", Path()),
@@ -138,13 +138,14 @@ RECIPES: dict[str, PolicyConfig] = {
     "reacher_jump": replace(_SMALL, task="reacher_jump"),
     "point_mass_cue": replace(_SMALL, task="point_mass_cue"),
 }
-"""Defaults by task. Plain SAC is enough for walker_walk. The others get standardised observations, layer norms in the
-critics and three-step returns; humanoid_walk also more fresh decisions for each update: physics is far cheaper than
-gradients. Where a run has levelled off, another from it (--start-from) with other steps or exploration climbs on."""
+"""Defaults by task. Plain SAC is enough for walker_walk. The others use standardised observations, layer norms in the
+critics and three-step returns; humanoid_walk also more decisions per update, since physics is far cheaper than
+gradients. Where a run plateaus, start another from it (--start-from) with a different learning rate or exploration.
+"""
 
 
 def build(config: PolicyConfig, task: Task) -> SAC:
-    """A new learner; its environments standardise observations only if the config says so."""
+    """A new learner; its environments standardise observations if the config says so."""
     envs = DummyVecEnv([lambda: StateEnv(task)] * config.envs)
     rounds = max(1, DECISIONS_A_ROUND // config.envs)
     network = {"net_arch": [config.hidden] if config.network == "simba" else [config.hidden, config.hidden]}
@@ -164,13 +165,13 @@ def build(config: PolicyConfig, task: Task) -> SAC:
         policy_kwargs=network | ({"layer_norm": True} if config.critic_norm else {}),
         seed=config.seed,
     )
-    model.set_logger(Logger(None, []))  # its own would leave an empty folder among the temporary files
+    model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     _set_temperature_rate(model, config.temperature_rate)
     return model
 
 
 def _set_temperature_rate(model: SAC, rate: float) -> None:
-    """Give the temperature a learning rate of its own; SBX takes the actor's."""
+    """Give the temperature its own learning rate; SBX uses the actor's."""
     state, optimiser = model.ent_coef_state, optax.adam(rate)
     model.ent_coef_state = state.replace(tx=optimiser, opt_state=optimiser.init(state.params))
 
@@ -213,14 +214,14 @@ def _norm(name: str, layer: Any) -> dict[str, Any]:
 
 
 def save_networks(model: SAC, path: Path) -> None:
-    """Write actor, critics, temperature and observation statistics, without optimisers, to one small file."""
+    """Write actor, critics, temperature and observation statistics to one small file, without optimisers."""
     leaves, _ = jax.tree_util.tree_flatten(_networks(model))
     arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
     write_bytes(path, save(arrays))
 
 
 def start_from_networks(model: SAC, path: Path) -> None:
-    """Load what `save_networks` wrote; the target critics become copies of the critics."""
+    """Load the file of `save_networks`; the target critics become copies of the critics."""
     stored = load(path.read_bytes())
     leaves, structure = jax.tree_util.tree_flatten(_networks(model))
     if any(f"{i:04d}" not in stored or stored[f"{i:04d}"].shape != leaf.shape for i, leaf in enumerate(leaves)):
@@ -235,12 +236,13 @@ def start_from_networks(model: SAC, path: Path) -> None:
 
 
 def refill(model: SAC, decisions: int, critic_updates: int) -> None:
-    """Fill the empty replay with the policy's own noisy decisions, then train the critics with the actor frozen."""
+    """Fill the empty replay buffer with the policy's own noisy decisions, then train the critics with the actor
+    frozen."""
     settings = model.gradient_steps, model.learning_starts, model.lr_schedule
     model.gradient_steps, model.learning_starts = 0, 0
     model.learn(decisions, reset_num_timesteps=False)
     model.gradient_steps, model.learning_starts, schedule = settings
-    model.lr_schedule = lambda _: 0.0  # the critics have a rate of their own
+    model.lr_schedule = lambda _: 0.0  # the critics have their own learning rate
     temperature = model.ent_coef_state
     for _ in range(critic_updates // model.gradient_steps):
         model.train(model.gradient_steps, model.batch_size)
@@ -249,7 +251,7 @@ def refill(model: SAC, decisions: int, critic_updates: int) -> None:
 
 
 def save_checkpoint(model: SAC, run: Path) -> None:
-    """Write all that the decisions made so far have left, in place of the checkpoint before."""
+    """Write the whole training state, replacing the previous checkpoint."""
     leaves, _ = jax.tree_util.tree_flatten(_states(model))
     buffer: Any = model.replay_buffer
     stop = buffer.buffer_size if buffer.full else buffer.pos
@@ -260,7 +262,7 @@ def save_checkpoint(model: SAC, run: Path) -> None:
 
 
 def restore_checkpoint(model: SAC, run: Path) -> int:
-    """Load the checkpoint; returns the decisions made so far, 0 without one. New episodes begin there."""
+    """Load the checkpoint; returns the decisions made so far, 0 without one. Episodes start anew."""
     if not (run / CHECKPOINT).exists():
         return 0
     stored = load((run / CHECKPOINT).read_bytes())
@@ -276,18 +278,18 @@ def restore_checkpoint(model: SAC, run: Path) -> int:
     for name in REPLAY_ARRAYS:
         getattr(buffer, name)[:stop] = stored[f"replay.{name}"]
     buffer.pos, buffer.full = position, stop == buffer.buffer_size
-    buffer.timeouts[position - 1] = True  # the episodes under way are not continued
+    buffer.timeouts[position - 1] = True  # interrupted episodes are not continued
     model.num_timesteps, model._n_updates = decisions, updates
     return decisions
 
 
 def _seed_from(seed: int, decisions: int) -> int:
-    """Of a run that goes on: other episodes than it began with, and than those that evaluate. Gymnasium adds to it."""
+    """Seed after resuming: episodes differ from those at the start and from evaluation. Gymnasium increments it."""
     return stream_seed(seed, "policy", "resumed", decisions) % 2**31
 
 
 def _states(model: SAC) -> tuple[Any, ...]:
-    """Everything SBX learns, optimisers included, and the keys of its draws."""
+    """Everything SBX learns, including optimisers, and its random keys."""
     policy = model.policy
     return policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key
 
@@ -311,10 +313,10 @@ def _set_statistics(model: SAC, stored: dict[str, np.ndarray]) -> None:
 
 
 def train_actor(config: PolicyConfig) -> dict[str, Path]:
-    """Train, or resume training, and export the actors: the exported files by quality.
+    """Train or resume, and export the actors; returns the exported files by quality.
 
     Raises:
-        UserError: a task without states, or a folder that holds something else than this run.
+        UserError: a task without states, or a folder with something other than this run.
     """
     task, run = TASKS.named(config.task), config.out
     if not layout_of(task).state_dim:
@@ -322,7 +324,7 @@ def train_actor(config: PolicyConfig) -> dict[str, Path]:
     _begin(config)
     model = build(config, task)
     done = restore_checkpoint(model, run)
-    curve = [row for row in read_curve(run) if row[0] <= done]  # without what a killed run wrote after its checkpoint
+    curve = [row for row in read_curve(run) if row[0] <= done]  # drop rows that a killed run wrote after its checkpoint
     if done == 0 and config.start_from is not None:
         curve = _start_from(model, config, config.start_from)
         done = int(model.num_timesteps)
@@ -341,7 +343,7 @@ def train_actor(config: PolicyConfig) -> dict[str, Path]:
 
 
 def _begin(config: PolicyConfig) -> None:
-    """Write a new run's settings; of a run that is there, refuse other ones. Its length may change."""
+    """Write a new run's settings, or reject settings that differ from an existing run's. Its length may change."""
     kept = {k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")}
     kept["start_from"] = None if config.start_from is None else str(config.start_from)
     path = config.out / SETTINGS
@@ -359,7 +361,7 @@ def _begin(config: PolicyConfig) -> None:
 
 
 def _start_from(model: SAC, config: PolicyConfig, start: Path) -> list[tuple[int, float]]:
-    """Take over another run's networks, curve, which is returned, and snapshots; its replay is made anew."""
+    """Copy another run's networks, curve (returned) and snapshots; its replay buffer is filled anew."""
     start_from_networks(model, start / NETWORKS)
     curve = read_curve(start)
     (config.out / "snapshots").mkdir(exist_ok=True)
@@ -380,7 +382,7 @@ def _write_curve(run: Path, curve: list[tuple[int, float]]) -> None:
 
 
 def main() -> None:
-    """Train by the command line."""
+    """Train with the command line's settings."""
     words = sys.argv[1:]
     if words and words[0].endswith(".py"):
         runpy.run_path(words.pop(0))

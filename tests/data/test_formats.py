@@ -20,6 +20,8 @@ from vd4rl_pomdp.data.folder import shard_paths
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.transfer import export_set, import_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
+from vd4rl_pomdp.nn.policy import policy_step
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.sweeps.plan import DataSet
 
 LENGTHS = [20, 25, 9]
@@ -443,12 +445,17 @@ def test_the_environment_tells_the_task(minari, tmp_path, capsys):
     assert open_dataset(tmp_path / "set", tmp_path / "cache").task == "walker_walk"
 
 
-def test_a_set_without_a_task_pretrains_and_is_not_evaluated(tmp_path, own_cache):
+def test_a_set_without_a_task_trains_and_is_not_evaluated(tmp_path, own_cache):
     folder = import_set("vd4rl", str(write_fake_set(tmp_path / "own", LENGTHS)), tmp_path / "pushing")[0].parent
     pretrain(smoke_pretrain(folder, tmp_path / "run"))
     assert "Imported from vd4rl: bytes" in (folder / "card.md").read_text()
-    with pytest.raises(UserError, match="unknown task 'own': choose one of"):
-        finetune(smoke_finetune(tmp_path / "run" / "encoder", folder, tmp_path / "policy"))
+    encoder, out = tmp_path / "run" / "encoder", tmp_path / "policy"
+    with pytest.raises(UserError, match=r"unknown task 'own': choose one of .*; `--eval-episodes 0` trains a policy"):
+        finetune(smoke_finetune(encoder, folder, out))
+    run = finetune(smoke_finetune(encoder, folder, out, eval_episodes=0))
+    assert run.finished
+    assert read_episodes(out / "episodes.csv") == []
+    assert policy_step(out / "policy") == 40
 
 
 def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):

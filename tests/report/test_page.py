@@ -66,9 +66,18 @@ def test_last_and_best_evaluation_stand_apart(tmp_path):
 
 
 def test_the_report_of_mazes_is_named_where_there_are_only_mazes(tmp_path):
-    with pytest.raises(UserError, match="no evaluated run yet; `vd4rl-pomdp navigation report` reports its mazes"):
+    with pytest.raises(UserError, match="no evaluated run; `vd4rl-pomdp navigation report` reports its mazes"):
         write_report([ROOT / "results" / "navigation" / "longer"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_pretraining_alone_is_reported(tmp_path, drawn):
+    """As with a dataset of a task that no policy can be evaluated on."""
+    pretraining(tmp_path / "runs")
+    text = write_report([tmp_path / "runs"], tmp_path / "out").page.read_text()
+    assert "Action loss of pretraining" in text
+    assert "No run has been evaluated yet" in text
+    assert "<h2>Final scores</h2>" not in text
 
 
 def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):

@@ -1,11 +1,11 @@
-"""Pack what a machine with a GPU and without a network needs, into one file.
+"""Pack everything that a machine with a GPU but no network needs into one file.
 
     python tools/card/pack.py card.tar.xz [--has FREEZE] [--python 3.12]
 
-Run it in a checkout, where pip has a network. The file holds this package with its commit, the packages that it needs
-at the versions of constraints.txt, without what it never imports, libraries that find the GPU's OpenGL, the tests,
-grids, and `run.py`, which does the rest there. The machine has torch and numpy; FREEZE is what its `pip freeze` prints:
-of these packages those that suit this one are left out. A line may be a name without a version.
+Run it in a checkout where pip has network access. The file holds this package with its commit, its dependencies pinned
+by constraints.txt (without parts that it never imports), libraries that find the GPU's OpenGL, the tests, the grids,
+and `run.py`, which runs on that machine. The machine has torch and numpy. FREEZE is its `pip freeze`: packages in a
+suitable version there are left out. A line may be a name without a version.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from vd4rl_pomdp.runs.provenance import COMMIT_FILE, git_commit
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
 NAME = "card"
-"""The folder in the file."""
+"""Folder in the archive."""
 DROPPED = [
     *(f"dm_control/{room}" for room in ("blender", "composer", "entities", "locomotion", "manipulation", "mjcf")),
     *("dm_control/third_party", "dm_control/viewer", "dm_control/mujoco/testing", "dm_control/suite/dog_assets"),
     *("dm_control/suite/*.png", "mujoco/experimental", "mujoco/mjx", "bin", "**/tests", "**/*_test.py", "**/*.pyc"),
 ]
-"""What no stage imports: 90% of dm_control, half of mujoco."""
+"""Files that no stage imports: 90% of dm_control, half of mujoco."""
 PROJECT = ("vd4rl_pomdp", "pretrain", "finetune", "baselines", "pyproject.toml", "setup.py", "README.md", "LICENSE")
 OPENGL = ("libegl1", "libglvnd0", "libopengl0", "libgl1", "libglx0", "libgles2")
-"""Debian's packages of the libraries that pass calls on to a GPU's own; its driver brings the rest."""
+"""Debian packages of the libraries that dispatch to a GPU's OpenGL; its driver brings the rest."""
 
 
 def wanted(has: list[str]) -> list[str]:
-    """Names in packages.txt, less what the machine has in a version that this package takes."""
+    """Names in packages.txt that the machine lacks in a suitable version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     ranges = {canonicalize_name(one.name): one.specifier for one in map(Requirement, project["dependencies"])}
     there = {}
@@ -56,7 +56,7 @@ def wanted(has: list[str]) -> list[str]:
 
 
 def install(names: list[str], python: str, site: Path) -> None:
-    """Install packages for another Python into a folder, and this one."""
+    """Install this package and others for another Python version into a folder."""
     platforms = [f"manylinux{which}_x86_64" for which in ("_2_28", "_2_27", "_2_24", "_2_17", "2014", "1")]
     pip = [
         sys.executable,
@@ -72,7 +72,7 @@ def install(names: list[str], python: str, site: Path) -> None:
     foreign = ["--only-binary=:all:", "--implementation", "cp", "--python-version", python, "--upgrade"]
     foreign += [word for platform in platforms for word in ("--platform", platform)]
     subprocess.run([*pip, *foreign, "-c", str(ROOT / "constraints.txt"), *names], check=True)
-    with tempfile.TemporaryDirectory() as work:  # setuptools adds what an earlier build left in the checkout
+    with tempfile.TemporaryDirectory() as work:  # setuptools would add what an earlier build left in the checkout
         for path in map(ROOT.joinpath, PROJECT):
             (shutil.copytree if path.is_dir() else shutil.copy)(path, Path(work) / path.name)
         subprocess.run([*pip, "--no-build-isolation", work], check=True)
@@ -80,7 +80,7 @@ def install(names: list[str], python: str, site: Path) -> None:
 
 
 def take_opengl(folder: Path) -> None:
-    """Unpack OPENGL's libraries into a folder, where Debian's tools are there."""
+    """Unpack OPENGL's libraries into a folder, if Debian's tools are available."""
     if not (shutil.which("apt-get") and shutil.which("dpkg")):
         print("no apt-get here: the machine needs its own libEGL", file=sys.stderr)
         return

@@ -1,18 +1,17 @@
-"""On a machine with a GPU and without a network: train until a deadline, and leave what is worth bringing home.
+"""Train until a deadline on a machine with a GPU but no network, and pack what to keep.
 
-    tar xf card.tar.xz                        # which pack.py made; tests, bench and the grids lie beside this file
+    tar xf card.tar.xz                        # made by pack.py; tests, bench and the grids are beside this file
     python3 card/run.py --out home --seconds 570 tests=120 bench=180 cell.toml -- --jobs-per-gpu 5 --stack 5
 
-Parts are carried out in order, each until its own limit, the last ones until the deadline: `tests` are those marked
-gpu, `bench` is `vd4rl-pomdp bench --gpu`, anything else is a grid of `vd4rl-pomdp sweep run`, whose further flags stand
-behind `--`. Of a grid the sets come first, each drawn by all cores, and while the tests run if there are any. At the
-deadline trainings write a checkpoint into the folder --work: on this machine the same command goes on from there.
+Parts run in order, each until its own limit, those without one until the deadline: `tests` are those marked gpu,
+`bench` is `vd4rl-pomdp bench --gpu`, anything else is a grid of `vd4rl-pomdp sweep run`, whose further flags follow
+`--`. A grid's datasets are collected first on all cores, alongside the tests if there are any. At the deadline,
+trainings write a checkpoint into --work: the same command on this machine resumes them.
 
---out holds log.txt; results/, the rows of finished runs, as `results add` keeps them; records.tar.xz, the small files
-of all runs, metrics among them; and, with --bring MIB, encoders.tar.*, finished encoders as far as they fit, smallest
-first, in parts of 15 MiB. Another machine goes on from such a folder by `--home FOLDER`: it trains neither these
-encoders, if its own set has the same content, nor the policies whose rows are there. What was not finished it begins
-anew.
+--out holds log.txt; results/, the rows of finished runs as written by `results add`; records.tar.xz, the small files of
+all runs, including metrics; and, with --bring MIB, encoders.tar.*, as many finished encoders as fit, smallest first, in
+parts of 15 MiB. Another machine continues from such a folder with `--home FOLDER`: it skips encoders whose dataset has
+the same content there, and policies whose rows exist. Unfinished runs start over.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 PROGRAM = [sys.executable, "-P", "-m", "vd4rl_pomdp"]
 TO_END = 40.0
-"""Seconds before the deadline in which trainings write their checkpoints, and what goes home is packed."""
+"""Seconds before the deadline for writing checkpoints and packing."""
 TO_PACK = 15.0
 VENDORS = ("/usr/share/glvnd", "/etc/glvnd", "/usr/local/nvidia/share/glvnd", "/usr/local/share/glvnd")
-"""Where a driver may say which library draws."""
+"""Where a driver may name its rendering library."""
 PART_BYTES = 15 * 2**20
 DRAWS = "from vd4rl_pomdp.data.parity import render_info; print(render_info())"
 
 
 class Session:
-    """One call: its clock, its log, and the environment of what it starts."""
+    """One invocation: clock, log, and environment of its commands."""
 
     def __init__(self, out: Path, seconds: float) -> None:
         self.began = time.monotonic()
@@ -58,23 +57,23 @@ class Session:
         self.processes: list[subprocess.Popen] = []
 
     def left(self, reserve: float = TO_END) -> float:
-        """Seconds until what runs has to end."""
+        """Seconds until running commands must end."""
         return self.began + self.seconds - reserve - time.monotonic()
 
     def say(self, line: str) -> None:
-        """Tell a line, with the time."""
+        """Log a line with a timestamp."""
         self.write(f"[{time.monotonic() - self.began:6.1f} s] {line}\n")
 
     def write(self, text: str) -> None:
-        """Put text on the screen and into the log."""
+        """Write text to the screen and the log."""
         self._log.write(text)
         with suppress(OSError):
             print(text, end="", flush=True)
 
     def run(self, words: list[str], seconds: float, quiet: bool = False) -> tuple[int, str]:
-        """Run a command for so many seconds at most; its exit code, and what it printed.
+        """Run a command with a time limit; returns its exit code and output.
 
-        It is asked to end by SIGTERM, as a training ends with a checkpoint, and killed where nothing else is left.
+        At the limit it gets SIGTERM, so that a training writes a checkpoint, then SIGKILL.
         """
         if seconds <= 0:
             self.say(f"no time left for {shlex.join(words)}")
@@ -103,19 +102,19 @@ class Session:
             process.wait(seconds)
         except subprocess.TimeoutExpired:
             self.say("time is up: asked to end")
-        finally:  # and if this process is asked to end itself
+        finally:  # also if this process is terminated
             if process.poll() is None:
                 process.terminate()
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(min(max(5.0, self.left(TO_PACK)), TO_END))
-                with suppress(ProcessLookupError):  # else it and its workers
+                with suppress(ProcessLookupError):  # and its workers
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         reader.join(5)
         return process.returncode, "".join(lines)
 
     def describe(self) -> None:
-        """Tell the machine and its torch."""
+        """Log the machine and its torch version."""
         found = (
             "import torch; print(torch.__version__, *map(torch.cuda.get_device_name, range(torch.cuda.device_count())))"
         )
@@ -124,7 +123,8 @@ class Session:
         self.say(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, torch {told.strip()} ({code})")
 
     def find_renderer(self) -> None:
-        """Choose the first environment in which a frame is drawn: the machine's own, or with what was packed."""
+        """Choose an environment that renders a frame, with the GPU if possible: the machine's own, or with packed
+        libraries."""
         files = [str(file) for folder in VENDORS for file in Path(folder).glob("egl_vendor.d/*nvidia*.json")]
         own = {
             "LD_LIBRARY_PATH": os.pathsep.join(filter(None, [str(HERE / "opengl"), os.environ.get("LD_LIBRARY_PATH")]))
@@ -145,7 +145,7 @@ class Session:
 
 
 class GridPart:
-    """A grid as the command that carries it out, and what it needs first."""
+    """A grid: its sweep command, and the datasets that it needs."""
 
     def __init__(self, session: Session, name: str, work: Path, home: Path | None, flags: list[str]) -> None:
         self._session = session
@@ -155,7 +155,7 @@ class GridPart:
         self._words += ["--done", str(home / "results")] if home and (home / "results").is_dir() else []
 
     def collect(self, until: float) -> int:
-        """Collect its sets, one after another, until a time; the exit code."""
+        """Collect its datasets, one after another, until a deadline; returns the exit code."""
         code, plan = self._session.run([*self._words, "--dry-run"], until - time.monotonic(), quiet=True)
         if code:
             self._session.write(plan)
@@ -171,25 +171,25 @@ class GridPart:
         return 0
 
     def train(self, until: float) -> int:
-        """Carry it out until a time; the exit code."""
+        """Run the sweep until a deadline; returns the exit code."""
         return self.collect(until) or self._session.run(self._words, until - time.monotonic())[0]
 
 
 def run_tests(session: Session, seconds: float, grids: list[GridPart]) -> int:
-    """Run the tests that need a GPU, and collect the sets of grids beside them; the tests' exit code."""
+    """Run the GPU tests while the grids' datasets are collected; returns the tests' exit code."""
     words = [sys.executable, "-m", "pytest", "-m", "gpu", "-v", "-ra", "--durations=0", "--durations-min=1"]
     words += ["-p", "no:cacheprovider", "--continue-on-collection-errors", "-c", str(HERE / "pyproject.toml")]
     files = [path for path in sorted((HERE / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
     until = time.monotonic() + session.left()
     beside = threading.Thread(target=lambda: [grid.collect(until) for grid in grids], daemon=True)
     beside.start()
-    code, _ = session.run([*words, *map(str, files)], seconds)  # other files may import what is not here
+    code, _ = session.run([*words, *map(str, files)], seconds)  # other files may import packages that are missing here
     beside.join()
     return code
 
 
 def restore(home: Path, runs: Path) -> None:
-    """Put the encoders that an earlier call brought home where a sweep finds them."""
+    """Copy encoders from an earlier invocation to where the sweep finds them."""
     parts = sorted(home.glob("encoders.tar.*"))
     if parts:
         with tarfile.open(fileobj=io.BytesIO(b"".join(part.read_bytes() for part in parts))) as file:
@@ -197,7 +197,7 @@ def restore(home: Path, runs: Path) -> None:
 
 
 def bring_home(session: Session, runs: Path, out: Path, mib: float) -> None:
-    """Put into `out` what is worth it."""
+    """Write everything worth keeping to `out`."""
     folders = [path.parent for path in runs.rglob("config.json") if path.parent.name != "encoder"]
     stages = {folder: json.loads((folder / "config.json").read_text()).get("stage", "") for folder in folders}
     if any((folder / "timing.json").exists() for folder in folders):
@@ -225,7 +225,7 @@ def bring_home(session: Session, runs: Path, out: Path, mib: float) -> None:
 
 
 def main() -> None:
-    """Carry out all parts."""
+    """Run all parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="+", metavar="PART", help="tests, bench or a grid; NAME=SECONDS limits it")
     parser.add_argument("--out", type=Path, required=True, help="what goes home")

@@ -1,1 +1,1 @@
-"""Speed and memory of every stage as ratios measured in one run, so that a noisy machine cannot bend them much."""
+"""Speed and memory of every stage, as ratios within one run, which vary less than times on a noisy machine."""

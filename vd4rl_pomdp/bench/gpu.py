@@ -1,7 +1,7 @@
-"""`vd4rl-pomdp bench --gpu`: what a card makes of the `paper` preset, replayed and eager, beside the peer, in one run.
+"""`vd4rl-pomdp bench --gpu`: the `paper` preset on one GPU, with CUDA graphs and eager, next to JAX, in one run.
 
-Times are medians over blocks of many steps, from one synchronisation to the next; the steps before them, in which
-libraries choose their kernels and steps are captured, are not counted.
+Times are medians over blocks of many steps between synchronisations. Warm-up steps, in which libraries choose kernels
+and steps are captured, are not counted.
 """
 
 from __future__ import annotations
@@ -55,56 +55,56 @@ AIMS: dict[str, tuple[str, float]] = {
     "encoding.seconds": ("<=", 15.0),
     "evaluation.seconds": ("<=", 60.0),
 }
-"""What is promised of one H200, its evaluation of 16 cores with EGL."""
+"""Goals for one H200; evaluation on 16 cores with EGL."""
 CORRUPTION = "patch+zero_frames"
 _BETWEEN_WAITS = 8
 _SETTLED = 12
-"""Steps before anything is timed: more than are run before a step is captured."""
+"""Warm-up steps; more than run before a step is captured."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured; the preset's settings but for those here."""
+    """Sizes of the measurements; everything else follows the preset."""
 
     episodes: int
     hidden_dim: int
     batch_size: int
     windows: int
-    """In a batch of pretraining."""
+    """Pretraining batch size."""
     views: int
     blocks: int
     updates: int
-    """Of a policy, in a block."""
+    """Policy updates per block."""
     steps: int
-    """Of an encoder, in a block."""
+    """Encoder steps per block."""
     played: int
-    """Episodes of the evaluation."""
+    """Evaluation episodes."""
     decisions: int
-    """Of each."""
+    """Decisions per evaluation episode."""
     runs: int
-    """Stacked policies, and encoders at a time."""
+    """Stacked policies, and concurrent encoders."""
     frame_encoder: str = "drq"
     window: int = 32
-    """Rows."""
+    """Window length in rows."""
 
 
-PAPER = Size(100, 1024, 256, 16, 4, 5, 512, 64, 100, 500, 5)  # as many updates as are drawn at once, or more
+PAPER = Size(100, 1024, 256, 16, 4, 5, 512, 64, 100, 500, 5)  # at least as many updates as are drawn at once
 TINY = Size(1, 16, 8, 2, 1, 1, 2, 1, 1, 3, 2, "nature", 16)
-"""Shows on any machine in seconds that all runs, and measures nothing worth telling."""
+"""Tests the code on any machine in seconds; the numbers mean nothing."""
 
 
 def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
-    """Run every measurement.
+    """Run all measurements.
 
     Args:
-        device_name: a GPU's; a CPU is accepted for a trial of the code, with `quick`.
-        quick: trial sizes, whose numbers claim nothing.
+        device_name: a GPU; with `quick` also a CPU.
+        quick: tiny sizes that only test the code.
 
     Returns:
-        Nested times, ratios and peaks of memory, with the machine, the commit and the versions.
+        Nested times, ratios and peak memory, with machine, commit and versions.
 
     Raises:
-        UserError: no GPU is visible, and none of this is a trial.
+        UserError: no GPU is visible, and `quick` is not set.
     """
     device = pick_device(device_name)
     if device.type != "cuda" and not quick:
@@ -116,7 +116,7 @@ def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
     def add(name: str, measure: Callable[[], dict[str, Any]]) -> None:
         try:
             results[name] = results.get(name, {}) | measure()
-        except Exception as error:  # whatever it is, the rest is worth measuring
+        except Exception as error:  # the remaining measurements are still useful
             traceback.print_exc()
             results[name] = results.get(name, {}) | {"failed": first_line(error)}
         free(device)
@@ -142,8 +142,8 @@ def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
 
 
 def measured(make: Callable[[], Callable[[], Any]], device: torch.device, steps: int, blocks: int) -> dict[str, float]:
-    """Milliseconds of a step, run as it is and replayed, and the memory that replaying it takes at most."""
-    with patch.dict(os.environ, {EAGER_VARIABLE: "1"}):  # what is made here is never replayed
+    """Milliseconds per step, eager and replayed, and peak memory when replayed."""
+    with patch.dict(os.environ, {EAGER_VARIABLE: "1"}):  # disables CUDA graphs
         slow = milliseconds(make(), device, max(1, steps // 4), max(1, blocks // 2))
     free(device)
     step = make()
@@ -155,7 +155,7 @@ def measured(make: Callable[[], Callable[[], Any]], device: torch.device, steps:
 
 
 def milliseconds(step: Callable[[], Any], device: torch.device, steps: int, blocks: int) -> float:
-    """Median over blocks of so many steps, of one step."""
+    """Median over blocks of the mean time of a step."""
     for _ in range(_SETTLED if device.type == "cuda" else 1):
         step()
     times = []
@@ -170,13 +170,13 @@ def milliseconds(step: Callable[[], Any], device: torch.device, steps: int, bloc
 
 
 def wait(device: torch.device) -> None:
-    """Until a GPU has done all that it was given."""
+    """Synchronise a GPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def free(device: torch.device) -> None:
-    """Give back the memory of what is gone, and begin to watch its peak."""
+    """Free cached memory and reset the peak."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
@@ -184,12 +184,12 @@ def free(device: torch.device) -> None:
 
 
 def peak(device: torch.device) -> dict[str, float]:
-    """Most memory of a GPU that tensors took since `free`, the data set's among them."""
+    """Peak GPU memory of tensors since `free`, including the dataset."""
     return {"peak_gib": torch.cuda.max_memory_allocated(device) / 2**30} if device.type == "cuda" else {}
 
 
 def pretraining(folder: Path, method: str, size: Size) -> PretrainConfig:
-    """Settings of a pretraining: the `paper` preset in bf16."""
+    """Pretraining config: the `paper` preset in bf16."""
     return PretrainConfig.of(
         "paper", data=folder, out=folder, method=method, corruption=CORRUPTION, precision="bf16",
         frame_encoder=size.frame_encoder, batch_size=size.windows, window=size.window,
@@ -198,12 +198,12 @@ def pretraining(folder: Path, method: str, size: Size) -> PretrainConfig:
 
 
 def next_step(dataset: Dataset, config: PretrainConfig) -> Callable[[], Any]:
-    """The next step of a pretraining."""
+    """A function that makes one pretraining step."""
     return make_trainer(dataset, config).update
 
 
 def encoding(dataset: Dataset, encoder: Encoder, folder: Path, size: Size) -> dict[str, float]:
-    """Seconds that the features of a set's views take."""
+    """Seconds to encode all views of a dataset."""
     device, config = dataset.t.device, FinetuneConfig.of("paper", precision="bf16")
     frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of(CORRUPTION), config.shift, config.precision, 0)
     histories = Histories(dataset, NO_OPTIONS, 3, 0)
@@ -215,14 +215,14 @@ def encoding(dataset: Dataset, encoder: Encoder, folder: Path, size: Size) -> di
 
 
 def stacked(dataset: Dataset, features: torch.Tensor, size: Size) -> dict[str, float]:
-    """Milliseconds of an update of several stacked runs of TD3+BC, of all and of each."""
+    """Milliseconds per update of several stacked TD3+BC runs: of the stack, and per run."""
     update = on_features(finetuning("td3_bc", size), dataset, features, size.runs)
     ms = milliseconds(update, features.device, size.updates, size.blocks)
     return {"runs": size.runs, "all_ms": ms, "a_seed_ms": ms / size.runs} | peak(features.device)
 
 
 def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of `drq_bc`, which trains its encoder, too."""
+    """A function that makes one update of `drq_bc`, including its encoder."""
     config = finetuning("drqv2_bc", size)
     encoder = Encoder(EncoderConfig(dataset.action_dim)).to(dataset.t.device)
     view = View(dataset, CorruptionConfig.of(CORRUPTION), config.shift, 0, STAGE)
@@ -237,21 +237,21 @@ def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Ten
 
 
 def finetuning(algorithm: str, size: Size) -> FinetuneConfig:
-    """Settings of a fine-tuning: the `paper` preset, an encoder in bf16."""
+    """Fine-tuning config: the `paper` preset with a bf16 encoder."""
     return FinetuneConfig.of(
         "paper", algorithm=algorithm, precision="bf16", hidden_dim=size.hidden_dim, batch_size=size.batch_size
     )
 
 
 def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, float]:
-    """Milliseconds that a step of one of several pretrainings at a time takes: that of all over their number.
+    """Milliseconds per step of concurrent pretrainings: time of one step of all, divided by their number.
 
-    In one process, each on a stream of its own, and in a process each; the better way counts.
+    Measured in one process with a CUDA stream each, and with a process each; the faster counts.
     """
     device = dataset.t.device
     streams = [torch.cuda.Stream(device) if device.type == "cuda" else None for _ in range(size.runs)]
     updates = [make_trainer(dataset, pretraining(folder, "mik+a", size)).update for _ in range(size.runs)]
-    wait(device)  # what they were made of is on another stream
+    wait(device)  # they were initialised on another stream
 
     def step() -> None:
         for stream, update in zip(streams, updates, strict=True):
@@ -269,11 +269,11 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
 
 
 def pretraining_steps(folder: str, device: str, size: dict[str, Any], seconds: float) -> Callable[[], dict[str, Any]]:
-    """Pretrain on the set in a folder, of `mik+a` in the `paper` preset and bf16, for so long."""
+    """Pretrain `mik+a` with the `paper` preset in bf16 for this many seconds."""
     place = torch.device(device)
     dataset = open_dataset(Path(folder) / "set", Path(folder) / "cache").to(place)
     trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size)))
-    milliseconds(trainer.update, place, 1, 1)  # settles it
+    milliseconds(trainer.update, place, 1, 1)  # warm-up
 
     def measure() -> dict[str, float]:
         start, steps = time.perf_counter(), 0
@@ -288,7 +288,7 @@ def pretraining_steps(folder: str, device: str, size: dict[str, Any], seconds: f
 
 
 def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: float) -> dict[str, Any]:
-    """The same update in JAX: on this card if JAX sees it, and only then a ratio."""
+    """The same update in JAX; a ratio only if JAX sees this GPU."""
     if importlib.util.find_spec("optax") is None:
         return {"jax": JAX_MISSING}
     shape = {
@@ -300,15 +300,15 @@ def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: floa
         "rows": dataset.num_rows,
     }
     given = "vd4rl_pomdp.bench.processes.jax_updates", shape, size.updates, size.blocks
-    # without the variable JAX takes three quarters of the card's memory as it starts
+    # by default JAX preallocates three quarters of the GPU's memory
     ((exact,), (tf32,)) = (apart(*given, words, XLA_PYTHON_CLIENT_PREALLOCATE="false") for words in (False, True))
-    if exact["device"] == "cpu":  # a kind of processor, in JAX's words
+    if exact["device"] == "cpu":  # a device kind in JAX
         return {"jax": f"sees no GPU: {exact['ms']:.3g} ms on the CPU"}
     return {"jax_ms": exact["ms"], "jax_over_replayed": exact["ms"] / replayed_ms, "jax_tf32_ms": tf32["ms"]}
 
 
 def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size) -> dict[str, Any]:
-    """Seconds of an evaluation on every core."""
+    """Seconds for an evaluation on all cores."""
     corruption = CorruptionConfig.of(CORRUPTION)
     save_encoder(
         folder / "encoder", encoder, EncoderCard("mik+a", "walker_walk", "bench", flat(corruption), 0, 0, "paper")

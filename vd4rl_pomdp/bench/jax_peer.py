@@ -1,7 +1,7 @@
-"""The peer: TD3+BC in JAX, of the same networks, batches and options as `finetune.algorithms.TD3BC`.
+"""TD3+BC in JAX with the networks, batches and options of `finetune.algorithms.TD3BC`, for comparison.
 
-Compiled whole, many updates in a call (`lax.scan`), as fast JAX code has it (JAX-CORL, github.com/nissymori/JAX-CORL).
-JAX comes with the extra `policy`: this module is imported only where the peer is asked for.
+Compiled as a whole, many updates per call (`lax.scan`), as in fast JAX code (JAX-CORL, github.com/nissymori/JAX-CORL).
+JAX comes with the extra `policy`, so this module is imported only where needed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from finetune.algorithms.td3_bc import NOISE_CLIP, TARGET_NOISE, TD3BC
 
 Net = list[tuple[Array, Array]]
-"""Weights (inputs, outputs) and biases of a perceptron's layers."""
+"""Weights (inputs, outputs) and biases of the layers of an MLP."""
 
 
 class Learnt(NamedTuple):
@@ -33,14 +33,14 @@ class Learnt(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What batches are gathered from: M transitions, V views of N features."""
+    """The data: M transitions, and N features in V views."""
 
     features: Array
     """(V, N, D)."""
     first: Array
-    """(V, M): number of the feature of a transition's first end."""
+    """(V, M): feature index of each transition's start."""
     last: Array
-    """(V, M)."""
+    """(V, M): feature index of each transition's end."""
     action: Array
     """(M, A)."""
     reward: Array
@@ -48,24 +48,24 @@ class Table(NamedTuple):
     discount: Array
     """(M,)."""
     mean: Array
-    """(D,), of the features."""
+    """(D,): mean of the features."""
     std: Array
-    """(D,)."""
+    """(D,): standard deviation of the features."""
 
 
 class BatchDraws(NamedTuple):
     """Random numbers of U updates."""
 
     transition: Array
-    """(U, B): transitions."""
+    """(U, B): transition indices."""
     view: Array
-    """(U, B)."""
+    """(U, B): view indices."""
     noise: Array
-    """(U, B, A), standard normal, for the target policy's actions."""
+    """(U, B, A), standard normal: target policy smoothing noise."""
 
 
 def learnt_by(algorithm: TD3BC) -> Learnt:
-    """The weights of an algorithm that has made no update."""
+    """The initial weights of an algorithm."""
     policy, target_policy = net(algorithm.policy.net), net(algorithm.target_policy.net)
     critics, targets = ((net(twin.first), net(twin.second)) for twin in (algorithm.critic, algorithm.target_critic))
     adam = optax.adam(algorithm.learning_rate)
@@ -73,17 +73,17 @@ def learnt_by(algorithm: TD3BC) -> Learnt:
 
 
 def net(module: nn.Sequential) -> Net:
-    """A copy of a perceptron's layers."""
+    """A copy of the layers of an MLP."""
     return [(as_jax(layer.weight).T, as_jax(layer.bias)) for layer in module if isinstance(layer, nn.Linear)]
 
 
 def as_jax(tensor: Tensor) -> Array:
-    """A copy of a tensor, where JAX computes."""
+    """A copy of a tensor on JAX's device."""
     return jnp.array(tensor.detach().cpu().numpy())
 
 
 def draw(key: Array, table: Table, updates: int, batch_size: int) -> BatchDraws:
-    """Numbers of so many updates, all at once."""
+    """Draw the random numbers of many updates at once."""
     index, view, noise = jax.random.split(key, 3)
     shape = updates, batch_size
     return BatchDraws(
@@ -96,8 +96,8 @@ def draw(key: Array, table: Table, updates: int, batch_size: int) -> BatchDraws:
 def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tuple[Learnt, dict[str, Array]]]:
     """A function, not compiled yet, that makes U updates with an algorithm's options.
 
-    U is even: in every second update the actor and the targets move. It gives what is learnt then, and the losses:
-    `critic_loss` (U / 2, 2) and `actor_loss` (U / 2,).
+    U is even: actor and targets are updated in every second update. The function returns the new parameters and the
+    losses: `critic_loss` (U / 2, 2) and `actor_loss` (U / 2,).
     """
     gamma, alpha, tau = algorithm.settings.gamma, algorithm.settings.alpha, algorithm.tau
     optimiser = optax.adam(algorithm.learning_rate)
@@ -144,14 +144,14 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tupl
 
 
 def batch(table: Table, draws: BatchDraws) -> tuple[Array, Array, Array]:
-    """Standardised representations (B, D) of the first ends, the actions (B, A), those of the last ends."""
+    """Standardised representations (B, D) at the start, actions (B, A), representations at the end."""
     ends = (table.features[draws.view, end[draws.view, draws.transition]] for end in (table.first, table.last))
     z, next_z = ((feature.astype(jnp.float32) - table.mean) / table.std for feature in ends)
     return z, table.action[draws.transition], next_z
 
 
 def forward(layers: Net, x: Array) -> Array:
-    """Outputs of a perceptron."""
+    """Outputs of an MLP."""
     for weight, bias in layers[:-1]:
         x = jax.nn.relu(x @ weight + bias)
     weight, bias = layers[-1]
@@ -159,6 +159,6 @@ def forward(layers: Net, x: Array) -> Array:
 
 
 def values(critics: tuple[Net, Net], z: Array, action: Array) -> tuple[Array, Array]:
-    """Both critics' values (B,)."""
+    """Values of both critics, (B,) each."""
     both = jnp.concatenate([z, action], -1)
     return forward(critics[0], both)[:, 0], forward(critics[1], both)[:, 0]

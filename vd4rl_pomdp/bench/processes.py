@@ -1,6 +1,6 @@
-"""What is measured in processes of their own, which import this module alone: peak memory, runs side by side, JAX.
+"""Measurements in separate processes, which import only this module: peak memory, concurrent runs, JAX.
 
-The library that torch's threads wait in is told how when it is loaded, so a run that waits otherwise is a process, too.
+How OpenMP threads wait is fixed when the library is loaded, so measuring another policy takes a new process, too.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ _SERVE = "from vd4rl_pomdp.bench.processes import serve; serve()"
 
 
 def apart(function: str, *arguments: Any, count: int = 1, **environment: str) -> list[dict[str, Any]]:
-    """What fresh processes measure at the same time, once all of them are ready.
+    """Run a measurement in fresh processes, all at the same time once every one is ready.
 
     Args:
-        function: "module.name" of what prepares a measurement: it returns a function that returns a dict.
-        arguments: its arguments, which JSON can write.
-        count: processes.
-        environment: variables of the processes.
+        function: "module.name" of a function that prepares the measurement and returns a function returning a dict.
+        arguments: its arguments, JSON-serialisable.
+        count: number of processes.
+        environment: environment variables of the processes.
 
     Raises:
-        WorkerDiedError: one ended without an answer.
+        WorkerDiedError: a process ended without an answer.
     """
     words = [sys.executable, "-c", _SERVE, json.dumps([function, *arguments])]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -65,7 +65,7 @@ def apart(function: str, *arguments: Any, count: int = 1, **environment: str) ->
 
 
 def serve() -> None:
-    """A process of `apart`."""
+    """Main function of a process of `apart`."""
     function, *arguments = json.loads(sys.argv[1])
     module, _, name = function.rpartition(".")
     measure = getattr(importlib.import_module(module), name)(*arguments)
@@ -75,21 +75,22 @@ def serve() -> None:
 
 
 def make_trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
-    """A trainer of the config's objective, its codebook fitted on a few actions."""
+    """A trainer for the config's objective; its codebook is fitted to a few actions."""
     target = build_target(config, dataset.action[:2000].cpu().numpy())
     objective = build_objective(config, dataset.action_dim, target).to(dataset.t.device)
     return Trainer(objective, make_batches(dataset, config, objective), config)
 
 
 def touch(frames: torch.Tensor) -> None:
-    """Read every page, so that it is in the page cache and mapped."""
+    """Read every page, so that all are in the page cache and mapped."""
     frames.view(-1)[::4096].max()
 
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
-    """Peak memory of a process that trains on the set in `folder`, and what a second one adds: all but the frames.
+    """Peak memory of a process that trains on the dataset in `folder`, and what a second one adds beyond the shared
+    frames.
 
-    Empty where no file of Linux tells it.
+        Empty where /proc is missing.
     """
     if not _STATUS.exists():
         return {}
@@ -102,7 +103,7 @@ def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
 
 
 def _train_a_little(folder: Path) -> list[int]:
-    """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
+    """Peak resident bytes and unshared bytes of a process that reads the whole dataset and trains."""
     dataset = open_dataset(folder / "set", folder / "cache")
     trainer = make_trainer(dataset, PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames"))
     for _ in range(3):
@@ -113,11 +114,12 @@ def _train_a_little(folder: Path) -> list[int]:
 
 
 def sharing(seconds: float, rounds: int = 3) -> dict[str, float]:
-    """Updates/s of a run alone, the slower of two at a time against it, and it against one that waits actively.
+    """Updates/s of a single run; ratio of the slower of two concurrent runs to it, and of it to one that waits
+    actively.
 
-    Args:
-        seconds: how long each process trains.
-        rounds: measurements of each, in turns, of which the medians count.
+        Args:
+            seconds: training time per process.
+            rounds: alternating repetitions; medians count.
     """
 
     def slowest(**how: Any) -> float:
@@ -129,7 +131,7 @@ def sharing(seconds: float, rounds: int = 3) -> dict[str, float]:
 
 
 def training(seconds: float) -> Callable[[], dict[str, float]]:
-    """Fine-tune on random features as the cpu preset does, for so long."""
+    """Fine-tune on random features with the cpu preset for this many seconds."""
     dim, actions = EncoderConfig(6).feature_dim, 6
     algorithm = _td3_bc(FinetuneConfig.of("cpu"), dim, actions)
     z, action, next_z = (torch.randn(256, width) for width in (dim, actions, dim))
@@ -155,15 +157,15 @@ def _td3_bc(config: FinetuneConfig, dim: int, action_dim: int) -> TD3BC:
 
 
 def jax_updates(shape: dict[str, int], updates: int, blocks: int, tf32: bool = False) -> Callable[[], dict[str, Any]]:
-    """The peer's TD3+BC on random features (see `jax_peer`), on the device that JAX picks: median ms of an update.
+    """TD3+BC in JAX on random features (see `jax_peer`), on JAX's default device: median milliseconds per update.
 
     Args:
         shape: `hidden_dim`, `batch_size`, `dim`, `action_dim`, `views`, `rows`.
-        updates: in a call, even.
-        blocks: calls, of which the median counts.
-        tf32: on a GPU, products of TF32 numbers, JAX's own default; else of float32 numbers, PyTorch's.
+        updates: updates per call; even.
+        blocks: calls, over which the median is taken.
+        tf32: on a GPU, TF32 matrix products (JAX's default) instead of float32 (PyTorch's).
     """
-    import jax  # of an extra
+    import jax  # an optional dependency
 
     from vd4rl_pomdp.bench import jax_peer
 

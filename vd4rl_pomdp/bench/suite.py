@@ -1,6 +1,6 @@
-"""`vd4rl-pomdp bench`: every measurement in turn, each against something else of the same run, and what is promised.
+"""`vd4rl-pomdp bench`: all measurements, each as a ratio to another one of the same run, and their goals.
 
-A noisy machine bends ratios less than times.
+Ratios vary less than times on a noisy machine.
 """
 
 from __future__ import annotations
@@ -85,25 +85,25 @@ GOALS: dict[str, tuple[str, float]] = {
     "mazes.first_person_over_default": (">=", 5.0),
     "mazes.training_overhead_share": ("<=", 0.2),
 }
-"""What this package promises on two cores without a GPU; of bf16 over fp32, where `machine.bf16_kernels` says yes."""
+"""Goals on two cores without a GPU; for bf16 over fp32, where `machine.bf16_kernels` is yes."""
 
 
 BATCH = 256
 EPISODE_ROWS = EPISODE_TRANSITIONS + 1
 ROUNDS = 5
-"""Times that two ways of rendering take turns."""
+"""Alternating repetitions of the two rendering modes."""
 HISTORY_WINDOW = 32
 
 
 def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
-    """Run every measurement.
+    """Run all measurements.
 
     Args:
-        quick: a smaller set and fewer repetitions.
-        device: where networks are trained.
+        quick: smaller dataset and fewer repetitions.
+        device: training device.
 
     Returns:
-        Nested ratios and rates, with the machine and the versions they were measured on.
+        Nested ratios and rates, with machine and versions.
     """
     place = pick_device(device)
     torch.manual_seed(0)
@@ -128,7 +128,7 @@ def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
 
 
 def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]], title: str) -> None:
-    """All measurements on the terminal, those that have a goal with it and a verdict."""
+    """Print all measurements, with goal and verdict where there is one."""
     table = Table(title=title)
     table.add_column("measurement")
     for name in ("value", "goal", ""):
@@ -137,7 +137,7 @@ def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]],
         shown = f"{value:.4g}" if isinstance(value, float) else str(value)
         relation, goal = goals.get(name, ("", 0.0))
         if relation and float(shown) == goal:
-            shown = str(value)  # a goal that is missed is not shown as reached
+            shown = str(value)  # do not round a missed goal to the goal
         reached = value <= goal if relation == "<=" else value >= goal if relation else None
         verdict = {True: "[green]reached[/]", False: "[red]missed[/]", None: ""}[reached]
         table.add_row(name, shown, f"{relation} {goal:g}" if relation else "", verdict)
@@ -145,7 +145,7 @@ def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]],
 
 
 def seconds_of(function: Callable[[], Any], repeats: int) -> float:
-    """Median seconds of a call, after one that is not counted."""
+    """Median seconds per call, after one warm-up call."""
     times = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
@@ -157,13 +157,14 @@ def seconds_of(function: Callable[[], Any], repeats: int) -> float:
 
 
 def alternating(rounds: int, *functions: Callable[[], Any]) -> list[float]:
-    """Median seconds of each function, called in turns: a machine that slows down slows all of them."""
+    """Median seconds per call of each function; calls alternate, so that a slow phase of the machine hits all of
+    them."""
     times = [[seconds_of(function, 1) for function in functions] for _ in range(rounds)]
     return [statistics.median(column) for column in zip(*times, strict=True)]
 
 
 def rate(function: Callable[[], Any], count: int) -> float:
-    """Calls per CPU-second, after some that are not counted."""
+    """Calls per CPU-second, after a warm-up."""
     for _ in range(5):
         function()
     start = time.process_time()
@@ -173,7 +174,8 @@ def rate(function: Callable[[], Any], count: int) -> float:
 
 
 def synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]:
-    """Write, decode and open a set of `episodes` full episodes; random stripes compress fast and cost like pixels."""
+    """Write, decode and open a dataset of full episodes; random stripes compress fast and cost as much as real
+    pixels."""
     rng = np.random.default_rng(0)
     (folder / "set").mkdir()
     for shard in range(0, episodes, 20):
@@ -199,7 +201,8 @@ def synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]
 
 
 def sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Gathering against copying the same bytes, and what shift and corruption add to it; new rows every time."""
+    """Gathering frames relative to copying as many bytes, and the added cost of shift and corruption; new rows every
+    time."""
     some = min(dataset.num_transitions, 20_000)
     touch(dataset.frames[:some])
     generator = torch.Generator().manual_seed(0)
@@ -231,7 +234,7 @@ def sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
 
 
 def collection(frames: int) -> dict[str, float]:
-    """Frames per CPU-second of the fast rendering against dm_control's default, and two workers against one."""
+    """Frames per CPU-second of fast rendering relative to dm_control's default, and of two workers relative to one."""
     rounds = [[rate(_acting(render), frames // ROUNDS) for render in ("exact", "fast")] for _ in range(ROUNDS)]
     exact, fast = (statistics.median(column) for column in zip(*rounds, strict=True))
     difference = compare(canary_frames("walker_walk", "fast"), canary_frames("walker_walk", "exact"))
@@ -247,7 +250,7 @@ def collection(frames: int) -> dict[str, float]:
 
 
 def _render_wall(job: tuple[Any, int]) -> float:
-    """Wall-clock seconds of one job, without the process's start."""
+    """Wall-clock seconds of one job, without process start."""
     act = _acting(job[0])
     start = time.perf_counter()
     for _ in range(job[1]):
@@ -256,7 +259,7 @@ def _render_wall(job: tuple[Any, int]) -> float:
 
 
 def _acting(render: Any) -> Callable[[], None]:
-    """One decision in an environment that has drawn its first frames, in a new episode when one is over."""
+    """A function that takes one step in a warmed-up environment, and resets it at the end of an episode."""
     env = make_env(TASKS["walker_walk"], render)
     action = np.zeros(env.action_dim, np.float32)
     env.reset(0)
@@ -270,7 +273,7 @@ def _acting(render: Any) -> Callable[[], None]:
 
 
 def maze_pictures(frames: int) -> dict[str, float]:
-    """Pictures per CPU-second of the mazes, against PointMaze's own `render()` at the same size."""
+    """Images per CPU-second of the mazes relative to PointMaze's own `render()` at the same size."""
     from vd4rl_pomdp.envs.maze import MazeEnv, gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
@@ -290,7 +293,8 @@ def maze_pictures(frames: int) -> dict[str, float]:
 
 
 def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
-    """Share of a step that the batch (sampling, corruption, shift) and the optimiser take, and bf16 against fp32."""
+    """Fraction of a step spent on the batch (sampling, corruption, shift) and the optimiser, and bf16 relative to
+    fp32."""
     results: dict[str, Any] = {"device": str(dataset.t.device)}
     steps: dict[str, float] = {}
     for precision in ("fp32", "bf16"):
@@ -306,9 +310,9 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
 
 def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
-    """Step time and frames/s of every method in the cpu preset, and what K and the resolution cost MIK+A.
+    """Step time and frames/s of every method in the cpu preset, and how K and the resolution affect MIK+A's step time.
 
-    Without those that regress states, which a set of random pictures has not.
+    Methods that regress states are left out: a synthetic dataset has none.
     """
     trained = [name for name, method in METHODS.items() if method.trained and not method.regresses_state]
     config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
@@ -328,7 +332,7 @@ def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
 
 def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
-    """A step of MIK+A in the cpu preset, and a row that its encoder streams, with every other memory over the GRU's."""
+    """Pretraining step and streaming row of MIK+A in the cpu preset with each other memory, relative to the GRU."""
     config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
     trainers = [make_trainer(dataset, config.altered(history=name)) for name in MEMORIES]
     obs, action = View(dataset).stacks(torch.tensor([3], device=dataset.t.device)), dataset.action[3:4]
@@ -348,9 +352,10 @@ def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
 
 
 def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Updates on cached features against updates that encode every batch, for both kinds of encoder; ReBRAC's cost.
+    """Updates on cached features relative to updates that encode every batch, for both kinds of encoder; cost of
+    ReBRAC.
 
-    The history is cut to a window: encoding whole episodes for every batch would take longer still.
+        The history is cut to a window, since encoding whole episodes per batch would take even longer.
     """
     memoryless = EncoderConfig(dataset.action_dim)
     history = replace(memoryless, history="gru", use_actions=True, history_window=HISTORY_WINDOW)
@@ -370,7 +375,8 @@ def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
 def _updates_per_s(
     dataset: Dataset, encoder_config: EncoderConfig, precision: Precision, repeats: int
 ) -> dict[str, float]:
-    """Rates of many cached updates in a row, as in training, and of as few exact ones as count both kinds of update."""
+    """Updates/s on cached features and with exact encoding; the latter over one period of the algorithm's delayed
+    updates."""
     config, device = _small(), dataset.t.device
     encoder = Encoder(encoder_config).eval().to(device)
     frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch+zero_frames"), config.shift, precision, 0)
@@ -385,7 +391,7 @@ def _updates_per_s(
 
 
 def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 1024)) -> dict[str, Any]:
-    """Milliseconds of a TD3+BC update, sampling included, and how many times as long float32 in JAX takes."""
+    """Milliseconds per TD3+BC update, including sampling, and the time of float32 JAX relative to it."""
     if importlib.util.find_spec("optax") is None:
         return {"jax": JAX_MISSING}
     results: dict[str, Any] = {}
@@ -405,7 +411,7 @@ def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 10
 
 
 def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Milliseconds of an update of one policy of the cpu preset, and of one of five that are trained as one."""
+    """Milliseconds per update of one policy of the cpu preset, and per policy in a stack of five."""
     updates, runs, features = 10, 5, random_features(dataset, FinetuneConfig.of("cpu").views)
     results: dict[str, float] = {}
     for precision in ("fp32", "bf16"):
@@ -418,7 +424,7 @@ def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
 
 
 def random_features(dataset: Dataset, views: int) -> torch.Tensor:
-    """(views, rows, D) float16, as wide as the usual frame encoder's, where the set is."""
+    """(views, rows, D) float16 on the dataset's device, with the default frame encoder's width."""
     width = EncoderConfig(dataset.action_dim).feature_dim
     return torch.randn(views, dataset.num_rows, width, device=dataset.t.device).half()
 
@@ -428,7 +434,7 @@ def _small(**settings: Any) -> FinetuneConfig:
 
 
 def _some(count: int, update: Callable[[], Any]) -> Callable[[], None]:
-    """So many updates in a row."""
+    """A function that makes several updates."""
 
     def updates() -> None:
         for _ in range(count):
@@ -440,7 +446,7 @@ def _some(count: int, update: Callable[[], Any]) -> Callable[[], None]:
 def on_features(
     config: FinetuneConfig, dataset: Dataset, features: torch.Tensor, runs: int = 1
 ) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of a run on cached (V, N, D) features, or of so many stacked ones."""
+    """A function that makes one update of a run, or of a stack of runs, on cached (V, N, D) features."""
     histories = Histories(dataset, NO_OPTIONS, 3, 0)
     sampler = partial(FeatureSampler, histories, features, config.batch_size, 3, 0.99)
     return next_update(config, dataset, features.shape[-1], sampler, runs)
@@ -454,18 +460,18 @@ def next_update(
     runs: int = 1,
     encoder: Encoder | None = None,
 ) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of a run, or of so many stacked ones, sampling included, as in training.
+    """A function that makes one training update of a run or a stack, including sampling.
 
     Args:
         config: settings of the run.
-        dataset: its set, on the device.
+        dataset: its dataset, on the device.
         dim: width of representations.
         batches: makes its sampler from a random stream.
-        runs: how many are trained as one.
-        encoder: what is trained, too, of an end-to-end method.
+        runs: number of runs in the stack.
+        encoder: encoder to train, for an end-to-end method.
     """
     device, trainers = dataset.t.device, []
-    unwritten: Any = [None] * 4  # where results would go, and what they would be compared with
+    unwritten: Any = [None] * 4  # outputs, and the reference to compare results with
     for seed in range(runs):
         draws, noise = (random_stream(seed, STAGE, name, device=device) for name in ("batches", "noise"))
         policy = Policy(dim, dataset.action_dim, config.hidden_dim).to(device)
@@ -478,7 +484,7 @@ def next_update(
 
 
 def maze_training() -> dict[str, float]:
-    """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
+    """Steps/s of `navigation train --preset cpu`, and the fraction of a step spent on sampling and the optimiser."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         collect(MazeCollectConfig.of("smoke", maze="no_curtain", out=folder / "set", workers=1))

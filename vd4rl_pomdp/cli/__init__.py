@@ -1,4 +1,4 @@
-"""The command line: one function a command. Bad input ends in one line and exit code 2, never in a traceback."""
+"""The command line: one function per command. Bad input ends with one line and exit code 2, never with a traceback."""
 
 from __future__ import annotations
 
@@ -53,34 +53,34 @@ COMMANDS = {
     "theory": ("studies.theory", "the paper's claims on finite worlds, by enumeration"),
     "bench": ("studies.bench", "speed and memory on this machine"),
 }
-"""Function, within this package, and summary of every command. A function takes the words behind its name, and what
-stands before them. Its module is imported when it is called: it may take seconds (torch), and the list of commands does
-not need it."""
+"""Function (within this package) and summary of every command. A function takes the words after its name, and the
+program name. Its module is imported on call: imports can take seconds (torch), and listing commands needs none.
+"""
 
 
 @dataclass(frozen=True)
 class End:
-    """What is left of a command."""
+    """How a command ended."""
 
     code: int = 0
     line: str = ""
-    """What the user is told, empty if nothing is."""
+    """Message for the user; empty for none."""
 
 
 _NO_MEMORY = re.compile("out of memory|allocate memory|Storage size calculation overflowed|ALLOC_FAILED")
-"""What torch says, of a CPU and of a GPU's libraries."""
+"""Out-of-memory messages of torch, on a CPU and from GPU libraries."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vd4rl-pomdp`."""
-    if getattr(multiprocessing.current_process(), "_inheriting", False):  # which a worker is while it imports its file
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker process that imports its main file
         print(
             'error: worker processes import this file: call main() below `if __name__ == "__main__":`', file=sys.stderr
         )
         sys.exit(2)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
+            stream.reconfigure(errors="backslashreplace")  # e.g. \u2028, which a terminal may not show
     end = run_to_end(sys.argv[1:] if arguments is None else arguments)
     if end.line:
         print(end.line, file=sys.stderr)
@@ -89,11 +89,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run_to_end(words: Sequence[str]) -> End:
-    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised."""
-    second = signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL  # whoever starts jobs ends them, too
+    """Run `vd4rl-pomdp WORDS`; only bugs raise."""
+    second = signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL  # the sweep driver terminates its jobs
     try:
         for word in words:
-            word.encode()  # names and paths go into files and pages, which are UTF-8
+            word.encode()  # names and paths are written to UTF-8 files
         with interrupt.handled(second):
             name = next((n for n in (" ".join(words[:2]), *words[:1]) if n in COMMANDS), None)
             if name is None:
@@ -112,7 +112,7 @@ def run_to_end(words: Sequence[str]) -> End:
         return End(130, _resume("interrupted", str(error)))
     except interrupt.Terminated as error:
         return End(143, _resume("terminated", error.reason))
-    except BrokenPipeError:  # what read the output is gone, as `head` goes
+    except BrokenPipeError:  # the reader closed the pipe, as `head` does
         return End(141)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
@@ -126,12 +126,12 @@ def run_to_end(words: Sequence[str]) -> End:
 
 
 def _resume(how: str, kept: str) -> str:
-    """One line for a signal's end; what was `kept` is where a training loop stood."""
+    """Message after a signal; `kept` says where training stopped."""
     return f"{how}: {kept + '; ' if kept else ''}re-run the same command to resume"
 
 
 def _show_commands(words: list[str]) -> None:
-    """Print all commands, or those of a group; raise UserError for a word that is neither."""
+    """Print all commands, or those of a group; UserError for an unknown word."""
     if words[:1] == ["--version"]:
         print(__version__)
         return

@@ -1,4 +1,4 @@
-"""`vd4rl-pomdp data`: collect, download, describe and check sets."""
+"""`vd4rl-pomdp data`: collect, download, describe and check datasets."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vd4rl_pomdp.core.parsing import parse, parse_stage
 from vd4rl_pomdp.sweeps.own_file import program_here
 
 REPLAY_TOLERANCE = 1e-6
-"""Largest difference between a stored and a replayed reward; on the machine that collected it is 0."""
+"""Largest accepted difference between stored and replayed rewards; 0 on the machine that collected them."""
 
 
 def collect(words: list[str], program: str) -> None:
-    """Render a set."""
+    """Collect a dataset."""
     from vd4rl_pomdp.data.collect import CollectConfig, collect
 
     config = parse(CollectConfig, words, program)
@@ -35,18 +35,19 @@ def download(
     endpoint: str | None = None,
     verify: bool = False,
 ) -> None:
-    """Fetch published V-D4RL 84-pixel sets: checked by SHA-256, resumable, each unique file once.
+    """Download published V-D4RL 84-pixel datasets: checked by SHA-256, resumable, each unique file once.
 
     Args:
-        task: walker_walk, cheetah_run or humanoid_walk, or several.
-        quality: random, medium_replay, medium, medium_expert or expert, or several: all of every task are fetched.
-        out: Folder to keep sets in, as OUT/TASK/QUALITY/84px.
-        endpoint: The mirror's address; default: HF_ENDPOINT, else https://huggingface.co.
-        verify: Compute the SHA-256 of files that are already there, too.
+        task: One or more of walker_walk, cheetah_run, humanoid_walk.
+        quality: One or more of random, medium_replay, medium, medium_expert, expert; each is downloaded for every
+            task.
+        out: Folder for datasets: OUT/TASK/QUALITY/84px.
+        endpoint: Address of a mirror; default: HF_ENDPOINT, else https://huggingface.co.
+        verify: Also check the SHA-256 of files that exist already.
     """
     from vd4rl_pomdp.data.download import check_published, download
 
-    check_published(task, quality)  # all of them, before hours of downloading the first
+    check_published(task, quality)  # reject unknown names before the first download, which takes hours
     for one, level in itertools.product(task, quality):
         shards = download(one, level, out, endpoint, verify)
         folder = shards[0].parent
@@ -65,17 +66,17 @@ def import_set(
     picture: str | None = None,
     clip_actions: bool = False,
 ) -> None:
-    """Write a set of another format as one of this package's; the same command resumes a cut import.
+    """Convert a dataset from another format; re-run the same command to resume.
 
     Args:
-        format: The format's name, as `vd4rl-pomdp list` shows them.
-        source: Path or name of the set.
-        out: Folder of the new set.
-        task: Its task, where the source does not tell; without one of that name here the set trains encoders alone.
-        quality: What to call the behaviour that made the data.
-        size: Height and width to which pictures are resized, by area; default: their own.
-        picture: Which observation holds the pictures, where there are several.
-        clip_actions: Clip actions that lie outside the source's bounds instead of refusing them.
+        format: Name of the format, as in `vd4rl-pomdp list`.
+        source: Path or name of the dataset.
+        out: Folder of the new dataset.
+        task: Its task, if the source does not name one; a dataset of an unregistered task can only train encoders.
+        quality: Name of the behaviour that made the data.
+        size: Height and width to resize images to, by area; default: no resizing.
+        picture: Observation key of the images, if there are several.
+        clip_actions: Clip actions outside the source's bounds instead of rejecting them.
     """
     from vd4rl_pomdp.data.transfer import import_set
 
@@ -90,13 +91,13 @@ def export_set(
     out: tyro.conf.Positional[Path],
     size: int | None = None,
 ) -> None:
-    """Write a set in another format, whole or not at all; what the format cannot keep is said.
+    """Convert a dataset to another format, atomically; prints what the format cannot keep.
 
     Args:
-        format: The format's name, as `vd4rl-pomdp list` shows them.
-        set: Folder of shards.
-        out: Folder to write.
-        size: Height and width to which frames are resized, by area; default: their own.
+        format: Name of the format, as in `vd4rl-pomdp list`.
+        set: Dataset folder.
+        out: Output folder.
+        size: Height and width to resize frames to, by area; default: no resizing.
     """
     from vd4rl_pomdp.data.transfer import export_set
 
@@ -106,10 +107,10 @@ def export_set(
 
 @command
 def card(set: tyro.conf.Positional[Path]) -> None:
-    """Write a set's data card, card.md and card.png, into its folder; `data collect` does so itself.
+    """Write a dataset's data card, card.md and card.png, into its folder; `data collect` does so itself.
 
     Args:
-        set: Folder of shards.
+        set: Dataset folder.
     """
     from vd4rl_pomdp.data.card import write_card
 
@@ -117,7 +118,7 @@ def card(set: tyro.conf.Positional[Path]) -> None:
 
 
 def view(words: list[str], program: str) -> None:
-    """Write a page to browse episodes."""
+    """Write an HTML page to browse episodes."""
     from vd4rl_pomdp.report.browse import ViewConfig, write_view
 
     print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
@@ -125,10 +126,10 @@ def view(words: list[str], program: str) -> None:
 
 @command
 def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
-    """Validate a set: format, episodes, checksums, and that its actions replay to its rewards.
+    """Validate a dataset: format, episodes, checksums, and that its actions replay to its rewards.
 
     Args:
-        set: Folder of shards.
+        set: Dataset folder.
         json: Print one JSON object.
     """
     from vd4rl_pomdp.data.check import check_dataset
@@ -145,10 +146,10 @@ def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
 
 @command
 def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) -> None:
-    """Compare rendered canary frames with golden ones, and a data set's background with the environment's.
+    """Compare rendered reference frames with stored ones, and a dataset's background with the environment's.
 
     Args:
-        set: A data set, whose background decides; without one the canaries do.
+        set: A dataset, whose background decides; without one, the reference frames do.
         json: Print one JSON object.
     """
     from vd4rl_pomdp.data.parity import check_parity

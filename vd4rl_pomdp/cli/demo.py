@@ -1,6 +1,6 @@
-"""The demo: the grids `quick` and `quick_navigation` as one sweep, a report and a film.
+"""The demo: the grids `quick` and `quick_navigation` as one sweep, with a report and a video.
 
-It shows that all works, not which method is best.
+It shows that everything works, not which method is best.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from vd4rl_pomdp.sweeps.options import LocalOptions
 from vd4rl_pomdp.sweeps.plan import Job, plan_jobs
 
 GRIDS = {"runs": "quick"} | ({"navigation": "quick_navigation"} if find_spec("gymnasium_robotics") else {})
-"""What is carried out, by the folder that it goes to: the mazes where their extra is installed."""
+"""Grid by output folder; mazes only if their extra is installed."""
 FILM = "navigation.gif"
 PAIR = tuple(f"walker_walk/medium_expert/patch+zero_frames/{method}" for method in ("mik+a", "acro"))
-"""Agents that ship: the main contrast of results/protocol.md."""
+"""Shipped agents: the main comparison of results/protocol.md."""
 DUEL = "agents.webp"
 PRESETS = {"cpu": False, "smoke": True}
-"""Whether a preset is the grid's testing subset, and plays one episode in place of ten."""
+"""By preset, whether the grid's testing subset runs and one episode is played instead of ten."""
 MOST_AT_ONCE = 4
-"""More jobs at a time than this would end no sooner."""
+"""Maximum concurrent jobs; more would not finish sooner."""
 
 
 def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
-    """The jobs of the demo, in order; UserError for an unknown preset."""
+    """The demo's jobs, in order; UserError for an unknown preset."""
     refuse_unknown("preset", preset, PRESETS)
     jobs = []
     for folder, grid in GRIDS.items():
@@ -58,15 +58,15 @@ def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
 
 @command
 def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> None:
-    """Two trained agents side by side; then every stage, in minutes, on small sets; a table, a report, films.
+    """Play two trained agents, then run every stage on small datasets, in minutes: a table, a report, videos.
 
     Args:
         out: Folder of the demo's data and runs; re-run the same command to resume.
-        jobs: Commands at a time; 0: as many as the GPUs take, or one a core, up to 4.
-        preset: cpu: minutes; smoke: only that every stage runs.
+        jobs: Concurrent jobs; 0: as many as the GPUs take, or one per core up to 4.
+        preset: cpu: minutes; smoke: only tests that every stage runs.
     """
     started = time.monotonic()
-    at_once = 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)  # 0: one a GPU
+    at_once = 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)  # 0: one per GPU
     options = LocalOptions(jobs=jobs or at_once)
     options.check()
     refuse_no_folder(out)
@@ -75,7 +75,7 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
     play([*PAIR, "--episodes", "1" if PRESETS[preset] else "10", "--film", str(out / DUEL)], "vd4rl-pomdp agents play")
     print("One training seed each. All seeds: results/protocol. Now the same from the start, small:", flush=True)
     words = ["report", str(out / "runs"), "--out", str(out / "report")]
-    for line in (*(job.words for job in planned if not job.finished), words):  # so that they can be run by hand
+    for line in (*(job.words for job in planned if not job.finished), words):  # to repeat them by hand
         print(f"$ vd4rl-pomdp {shlex.join(line)}", file=sys.stderr)
     print(f"Where this stands: vd4rl-pomdp sweep status {out}; what it prints: {folder.path / 'logs'}", file=sys.stderr)
     carry_out([folder.keep_plan("demo", planned)], folder, "local", options)
@@ -89,7 +89,7 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
 
 
 def conclusion(jobs: list[Job]) -> Iterator[str]:
-    """What the demo's methods know and return, and how sure it is: lines of text."""
+    """Summary lines: probe errors and returns of the demo's methods, with standard errors."""
     policies = [(job.settings, job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
     yield f"Under {corruption}, what is not known of pose and velocity (error of a"
@@ -107,7 +107,7 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
 
 
 def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
-    """Write the film, and say how far each method misses the mass while a curtain hides it: lines of text."""
+    """Write the video; yield lines with each method's position error while a curtain hides the mass."""
     runs = load_runs(find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
     trajectories = {run.condition.method: run.trajectory for run in runs if run.trajectory is not None}
     write_film(trajectories, get_maze(runs[0].condition.maze), film)

@@ -1,4 +1,4 @@
-"""`vd4rl-pomdp hub`: encoders, agents and data sets to and from the Hugging Face Hub; `agents`: those of one's own."""
+"""`vd4rl-pomdp hub`: upload and download encoders, agents and datasets; `agents`: export and play local ones."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ def push(
     revision: str = "main",
     license: str = "mit",
 ) -> None:
-    """Write an encoder, an agent or a data set to the Hub as one commit; endpoint and token are huggingface_hub's.
+    """Upload an encoder, an agent or a dataset to the Hugging Face Hub in one commit; huggingface_hub's endpoint and
+    token.
 
-    Args:
-        folder: RUN/encoder, what `agents export` wrote, or the folder of a data set.
-        repository: OWNER/NAME for an encoder or agent, datasets/OWNER/NAME for a data set; made if there is none.
-        private: Make it private.
-        revision: Branch to write to; made if there is none.
-        license: Licence that its card names, as the Hub spells it.
+        Args:
+            folder: RUN/encoder, an agent from `agents export`, or a dataset folder.
+            repository: OWNER/NAME for an encoder or agent, datasets/OWNER/NAME for a dataset; created if missing.
+            private: Make it private.
+            revision: Branch to write to; created if missing.
+            license: Licence for its card, as the Hub spells it.
     """
     print(hub.push(folder, repository, private, revision, license))
 
 
 @command
 def pull(repository: tyro.conf.Positional[str], folder: tyro.conf.Positional[Path], revision: str = "main") -> None:
-    """Fetch an encoder, an agent or a data set that `hub push` wrote, and check it; re-run to resume.
+    """Download and check an encoder, an agent or a dataset that `hub push` uploaded; re-run to resume.
 
     Args:
-        repository: OWNER/NAME for an encoder or agent, datasets/OWNER/NAME for a data set.
-        folder: Folder to make; an empty one will do.
+        repository: OWNER/NAME for an encoder or agent, datasets/OWNER/NAME for a dataset.
+        folder: New or empty folder.
         revision: Branch, tag or commit.
     """
     fetched = hub.pull(repository, folder, revision)
@@ -49,13 +50,13 @@ def pull(repository: tyro.conf.Positional[str], folder: tyro.conf.Positional[Pat
 
 @command
 def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, workers: int = 0) -> None:
-    """Write a fine-tuned run's encoder and policy as an agent's folder: half precision, a card, checksums.
+    """Export a fine-tuned run's encoder and policy as an agent: half precision, a card, checksums.
 
     Args:
-        run: Folder of a finished fine-tuning.
-        out: Folder to make; an empty one will do.
-        episodes: Episodes that the rounded agent plays for its card, under its corruption and under none.
-        workers: Processes; 0 uses every core.
+        run: Folder of a finished fine-tuning run.
+        out: New or empty folder.
+        episodes: Episodes played by the exported agent for its card, with and without its corruption.
+        workers: Worker processes; 0 uses every core.
     """
     from finetune.export import export_agent
 
@@ -70,13 +71,13 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
 def play(
     agents: tyro.conf.Positional[list[str]], episodes: int = 10, film: Path | None = None, workers: int = 0
 ) -> None:
-    """Let agents of one task play the same episodes, under the corruption of the first: returns, and a film.
+    """Play the same episodes with several agents of one task, under the first one's corruption: returns and a video.
 
     Args:
-        agents: Names of agents that ship, or folders that `agents export` and `hub pull` wrote.
-        episodes: How many each plays; episode i starts at the same state for all.
-        film: File to write (animated WebP): the first episode of each, with what it sees.
-        workers: Processes; 0 uses every core.
+        agents: Names of shipped agents, or folders from `agents export` and `hub pull`.
+        episodes: Episodes per agent; episode i has the same initial state for all.
+        film: File to write (animated WebP): each agent's first episode as it sees it.
+        workers: Worker processes; 0 uses every core.
     """
     from finetune.export import play_agents
     from vd4rl_pomdp.report.films import side_by_side

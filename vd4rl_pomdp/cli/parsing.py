@@ -1,4 +1,4 @@
-"""Functions to commands, and results to text."""
+"""From functions to commands, from results to text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LONGEST_LIST = 6
 
 
 def command(function: Callable[..., None]) -> Command:
-    """A command whose flags are a function's parameters, described in its docstring."""
+    """Make a command of a function: its parameters are the flags, its docstring is the help."""
 
     @functools.wraps(function)
     def bound(*args: Any, **kwargs: Any) -> Callable[[], None]:
@@ -34,7 +34,7 @@ def show(result: dict[str, Any], as_json: bool) -> None:
 
 
 def _text(value: Any) -> str:
-    """A value on one line; of a long list its ends and its length."""
+    """A value as one line; long lists are shortened to their ends and length."""
     if isinstance(value, list):
         shown = value if len(value) <= _LONGEST_LIST else [value[0], "...", value[-1], f"({len(value)})"]
         return " ".join(map(str, shown))

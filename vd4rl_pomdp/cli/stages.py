@@ -1,4 +1,4 @@
-"""The stages of an experiment: pretrain, finetune, evaluate; and the list of their parts."""
+"""Commands of the experiment stages: pretrain, finetune, evaluate; and `list`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def pretrain(words: list[str], program: str) -> None:
 
 
 def finetune(words: list[str], program: str) -> None:
-    """Train a policy, or several as one: WORDS + WORDS, or one for each of `--seeds`."""
+    """Train a policy, or a stack of several: WORDS + WORDS, or one per seed of `--seeds`."""
     from finetune.config import FinetuneConfig
     from finetune.train import finetune_all
 
@@ -40,13 +40,14 @@ def finetune(words: list[str], program: str) -> None:
 
 
 def _between(words: list[str], mark: str) -> list[list[str]]:
-    """The words before, between and after the marks."""
+    """Split words at each `mark`."""
     ends = [number for number, word in enumerate(words) if word == mark]
     return [words[first:end] for first, end in zip([0, *(e + 1 for e in ends)], [*ends, len(words)], strict=True)]
 
 
 def _of_seeds(words: list[str]) -> list[list[str]]:
-    """The words of each run that `--seeds` stands for: `--seed N --out OUT/seedN`; without it those that are given."""
+    """One list of words per seed of `--seeds`, with `--seed N --out OUT/seedN`; without the flag, the words as
+    given."""
     reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     reader.add_argument("--seeds", nargs="?", const="")
     seeds, rest = reader.parse_known_args(words)
@@ -68,32 +69,30 @@ def _of_seeds(words: list[str]) -> list[list[str]]:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone, whose
-    options are flags, too: name it before --help."""
+    """Evaluate a fine-tuned run again, as trained and uncorrupted, or under one --corruption (named before --help)."""
 
     run: tyro.conf.Positional[Path]
-    """A fine-tuning run's folder."""
+    """Folder of a fine-tuning run."""
     corruption: str | None = None
-    """Corruption at evaluation, with the run's own options (a patch's size) where it reads them and none are given;
-    default: the one that it was trained under, and then none, which takes as long again."""
+    """Corruption at evaluation; its options default to the run's own. Default: the training corruption, then none."""
     stages: tuple[Options, ...] = ()
     """Options of the corruption."""
     episodes: int = 10
-    """Episodes under each corruption."""
+    """Episodes per corruption."""
     parts: int = 1
-    """Also tell reward and action error in so many equal parts of the episodes: when a policy loses its way."""
+    """Also report reward and action error for this many equal parts of an episode."""
     workers: int = 0
-    """Processes; 0 uses every core."""
+    """Worker processes; 0 uses every core."""
     out: Path | None = None
     """Append the raw rows to this CSV file."""
     keep: bool = False
-    """Append the rows under a given corruption to the run's own episodes.csv, where reports find them."""
+    """Append the rows under the given corruption to the run's own episodes.csv, where reports find them."""
     json: bool = False
     """Print one JSON object."""
 
 
 def _evaluation(words: list[str], program: str, own: dict[str, Any]) -> Evaluation:
-    """Parse the command's words; what a corruption's options are where none are given is taken from `own`."""
+    """Parse the command line; options of the corruption that are not given default to `own`."""
     name = chosen_by(words, ["corruption"]).get("corruption")
     stages = CorruptionConfig.fill(own | {"corruption": name}).stages if name else ()
     asked: Evaluation = parse(Evaluation, words, program, Evaluation(tyro.MISSING, name, stages))
@@ -101,7 +100,7 @@ def _evaluation(words: list[str], program: str, own: dict[str, Any]) -> Evaluati
 
 
 def evaluate(words: list[str], program: str) -> None:
-    """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone."""
+    """Evaluate a fine-tuned run again, as trained and without corruption, or under a given corruption only."""
     from finetune.evaluation import another, by_part, evaluate_run, refuse_kept
     from vd4rl_pomdp.data.reference import Reference, summarise
     from vd4rl_pomdp.nn.encoder_folder import read_record
@@ -112,13 +111,13 @@ def evaluate(words: list[str], program: str) -> None:
     asked = _evaluation(words, program, {})
     run, out, parts, json = asked.run, asked.out, asked.parts, asked.json
     refuse_number("parts", parts, 1)
-    there = read_episodes(run / EPISODES_FILE)  # what is no run is refused below
+    there = read_episodes(run / EPISODES_FILE)  # a folder without a run is rejected below
     trained = read_record(run / "encoder").pretrain.corruption if there else {}
     asked = _evaluation(words, program, trained)
     if out is not None:
         refuse_inside(out)
         if there:
-            append_episodes(out, [])  # a path that cannot be written is known before any episode is played
+            append_episodes(out, [])  # fail before playing if the file cannot be written
     options = {name: value for stage in asked.stages for name, value in flat(stage).items()}
     if asked.keep and asked.corruption is None:
         raise UserError("--keep is for a corruption that --corruption names: a run's own evaluations are kept already")
@@ -144,7 +143,7 @@ def evaluate(words: list[str], program: str) -> None:
 @command
 def list_parts() -> None:
     """List methods, corruptions, algorithms, frame encoders, memories and tasks, one line each."""
-    import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
+    import finetune.algorithms  # noqa: F401 (importing the parts fills the registries)
     import pretrain.objectives  # noqa: F401
     import vd4rl_pomdp.core.tasks
     import vd4rl_pomdp.data.formats  # noqa: F401
@@ -155,7 +154,7 @@ def list_parts() -> None:
 
 
 def _lines(registry: Registry[Any]) -> Iterator[str]:
-    """One line for each part of a kind, and for each that an installed package offers in vain."""
+    """One line per part of a kind, including parts of installed packages that cannot be loaded."""
     names = [*registry, *registry.broken]
     width = max(map(len, names))
     for name, part in registry.items():

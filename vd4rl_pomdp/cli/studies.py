@@ -22,14 +22,16 @@ def report(
     only: tuple[str, ...] = (),
     change: tuple[str, ...] = (),
 ) -> None:
-    """Write an HTML page, tables and figures about fine-tuning runs; `report compare A B` puts two sets together.
+    """Write an HTML report with tables and figures about fine-tuning runs; `report compare A B` compares two sets of
+    runs.
 
-    Args:
-        runs: Run folders, results folders, or folders that contain some; what `theory --out` wrote adds its section.
-        out: Folder of the report.
-        grid: Report the cells of this grid alone: one that ships (`vd4rl-pomdp sweep list`), or a TOML or Python file.
-        only: Of the grid, cells with these values alone: method=mik+a,acro seed=0.
-        change: Settings that the grid was carried out with in place of its own: preset=cpu finetune.updates=20000.
+        Args:
+            runs: Run folders, results folders, or folders that contain some; output of `theory --out` adds its section.
+            out: Folder of the report.
+            grid: Report only the cells of this grid: a shipped one (`vd4rl-pomdp sweep list`), or a TOML or Python
+                file.
+            only: Report only grid cells with these values: method=mik+a,acro seed=0.
+            change: Overrides that the grid was run with: preset=cpu finetune.updates=20000.
     """
     from vd4rl_pomdp.report import print_summary, write_report
     from vd4rl_pomdp.report.load import ALL
@@ -50,7 +52,7 @@ def report(
 
 
 def _named(runs: list[Path]) -> list[Path]:
-    """Folders that a command line names, at least one."""
+    """The folders of a command line; UserError if there are none."""
     if not runs:
         raise UserError("no runs are named: name at least one folder")
     return runs
@@ -58,11 +60,11 @@ def _named(runs: list[Path]) -> list[Path]:
 
 @command
 def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: Path | None = None) -> None:
-    """Compare two result sets, condition by condition: scores, their difference, n, and settings that differ.
+    """Compare two sets of runs by condition: scores, their difference, n, and settings that differ.
 
     Args:
         a: Run folder, results folder, or folder that contains some.
-        b: What it is compared with, likewise.
+        b: The same, to compare with.
         out: Also write an HTML page, CSV and LaTeX into this folder.
     """
     from vd4rl_pomdp.report.compare import check_out, compare_results, print_comparison, write_comparison
@@ -78,13 +80,13 @@ def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: P
 
 @command
 def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
-    """Append finished runs to a results folder: their small files and raw evaluation rows, without weights and films.
+    """Append finished runs to a results folder: small files and raw evaluation rows, without weights and videos.
 
-    A run that is there already stays as it is, whatever its rows.
+    A run that is already there is not changed.
 
     Args:
         runs: Run folders, results folders, or folders that contain some.
-        out: The results folder, made if missing.
+        out: The results folder; created if missing.
     """
     from vd4rl_pomdp.runs.results import add_results
 
@@ -93,11 +95,11 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
 
 @command
 def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> None:
-    """Check the rows of a results folder against their own records, and replay an episode of one of its runs.
+    """Check the rows of a results folder against their records, and optionally replay an episode of a run.
 
     Args:
         folder: The results folder.
-        replay: A run's folder, with encoder and policy: the first episode of its last evaluation is played again.
+        replay: Folder of a run with encoder and policy; the first episode of its last evaluation is replayed.
     """
     from finetune.evaluation import REPLAYED
     from finetune.evaluation import replay as play_again
@@ -121,7 +123,7 @@ def theory(json: bool = False, out: Path | None = None) -> None:
 
     Args:
         json: Print one JSON object.
-        out: Also write an HTML page with figures, and the JSON, into this folder.
+        out: Also write the JSON and an HTML page with figures into this folder.
     """
     from vd4rl_pomdp.report.theory import FILE, print_theory, write_theory
     from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -129,7 +131,7 @@ def theory(json: bool = False, out: Path | None = None) -> None:
 
     if out is not None:
         refuse_foreign(out, "study of the theory", FILE)
-        out.mkdir(parents=True, exist_ok=True)  # before anything is computed
+        out.mkdir(parents=True, exist_ok=True)  # fail before the computation
     study = theory_study()
     if json:
         print(json_library.dumps(study))
@@ -146,10 +148,10 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
     Args:
         json: Print one JSON object instead of a table.
         quick: A tenth of the frames and fewer repetitions: rougher numbers; fixed costs dominate the peak memory. With
-            --gpu a trial of the code, whose numbers mean nothing.
-        gpu: In its place what one GPU makes of the paper preset: steps replayed and one by one, stacked seeds, the same
-            update in JAX, encoding, an evaluation; under three minutes.
-        device: Where networks are trained: auto, cpu or cuda. With --gpu and --quick, cpu tries the code without one.
+            --gpu only a test of the code.
+        gpu: Benchmark the paper preset on one GPU instead: CUDA graphs, stacked seeds, the same update in JAX,
+            encoding, an evaluation; under three minutes.
+        device: Training device: auto, cpu or cuda. With --gpu and --quick, cpu tests the code without a GPU.
     """
     from vd4rl_pomdp.bench import gpu as on_gpu
     from vd4rl_pomdp.bench.suite import GOALS, bench, print_table
@@ -173,15 +175,15 @@ def certify(
     change: tuple[str, ...] = (),
     jobs: int = 0,
 ) -> None:
-    """Train supervised encoders with and without a memory, and tell whether a set needs one. Re-run to resume.
+    """Decide with supervised encoders whether a dataset needs a memory of past observations. Re-run to resume.
 
     Args:
-        data: Folder of a set with simulator states; the certificate is kept there, too.
-        corruption: What makes the observations partial.
+        data: Folder of a dataset with simulator states; the certificate is written there.
+        corruption: The corruption that makes observations partial.
         out: Folder of the runs.
-        returns: Also train and evaluate policies, beside what linear probes find.
-        change: Settings of the trainings: seed=0,1,2,3,4 preset=cpu pretrain.patch_size=24 finetune.updates=60000.
-        jobs: Commands at a time; 0: as many as the GPUs take, or one without a GPU.
+        returns: Also train and evaluate policies, in addition to linear probes.
+        change: Training settings: seed=0,1,2,3,4 preset=cpu pretrain.patch_size=24 finetune.updates=60000.
+        jobs: Concurrent jobs; 0: as many as the GPUs take, or one without a GPU.
     """
     from vd4rl_pomdp.cli.sweeps import carry_out
     from vd4rl_pomdp.core.errors import refuse_no_folder
@@ -223,7 +225,7 @@ def navigation_train(words: list[str], program: str) -> None:
 
 
 def navigation_policy(words: list[str], program: str) -> None:
-    """Train the policy that walks the first-person maze."""
+    """Train the policy that collects the first-person maze's data."""
     from vd4rl_pomdp.studies.navigation.drivers import FirstPersonConfig, train_first_person
 
     config = parse(FirstPersonConfig, words, program)
@@ -235,7 +237,7 @@ def navigation_policy(words: list[str], program: str) -> None:
 def navigation_report(
     runs: tyro.conf.Positional[list[Path]], out: Path = Path("navigation-report"), pictures: bool = True
 ) -> None:
-    """Write the paper's navigation tables and figures about finished runs.
+    """Write the paper's navigation tables and figures for finished runs.
 
     Args:
         runs: Run folders, results folders, or folders that contain some.

@@ -1,4 +1,4 @@
-"""`vd4rl-pomdp sweep`: grids of runs on whatever there is to run them."""
+"""`vd4rl-pomdp sweep`: run grids on this machine, Slurm or Ray."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _ExecutorConfig(StageConfig):
-    """What carries out jobs."""
+    """The executor of jobs."""
 
     executor: str = "local"
     """local (this machine), slurm or ray."""
     options: Annotated[Options, tyro.conf.arg(name="executor")] = NO_OPTIONS
-    """What the chosen executor can be told."""
+    """Options of the executor."""
 
     preset: tyro.conf.Suppress[str] = "paper"
     choosers: ClassVar[tuple[str, ...]] = ("executor",)
@@ -46,32 +46,32 @@ class _ExecutorConfig(StageConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class RunCommand(_ExecutorConfig):
-    """Carry out a grid: collect its sets, pretrain its encoders, once each, and fine-tune its policies.
+    """Run a grid: collect its datasets, pretrain each encoder once, and fine-tune its policies.
 
-    Re-run the same command to resume. Exit code 0: all is finished; 1: some is not.
+    Re-run the same command to resume. Exit code 0: all jobs are finished; 1: some are not.
     """
 
     grid: tyro.conf.Positional[str] = ""
-    """A grid that ships (`vd4rl-pomdp sweep list`), or a TOML or Python file."""
+    """A shipped grid (`vd4rl-pomdp sweep list`), or a TOML or Python file."""
     out: Path = Path()
-    """Folder of the runs; runs that lie there are found by what they computed."""
+    """Folder of the runs; existing runs are reused."""
     data: Path | None = None
-    """Folder of the sets, DATA/TASK/QUALITY: those that are there are taken, others collected; default OUT/data."""
+    """Folder of datasets, DATA/TASK/QUALITY; existing ones are reused, others collected. Default: OUT/data."""
     only: list[str] = field(default_factory=list)
-    """Cells with these values alone: method=mik+a,acro seed=0."""
+    """Run only cells with these values: method=mik+a,acro seed=0."""
     change: list[str] = field(default_factory=list)
-    """Settings that replace those of every block: preset=cpu finetune.updates=20000."""
+    """Overrides for every block: preset=cpu finetune.updates=20000."""
     testing: bool = False
-    """Run the grid's testing subset: minutes, to see that all works."""
+    """Run the grid's testing subset: minutes, to check that everything works."""
     done: list[Path] = field(default_factory=list)
     """Results folders whose runs count as finished."""
     dry_run: bool = False
-    """Print every job, what is finished and what is shared; run nothing."""
+    """Print every job, which are finished and which are shared; run nothing."""
 
 
 def run(words: list[str], program: str) -> None:
-    """Carry out a grid, or resume it."""
-    # Imported here, as in every command: they load torch and the simulators, which no other command has to wait for.
+    """Run or resume a grid."""
+    # Imports are local, as in every command: torch and the simulators load slowly.
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
     from vd4rl_pomdp.sweeps.grid import SHARED, load_grid, names, narrow
@@ -85,12 +85,12 @@ def run(words: list[str], program: str) -> None:
     grid = load_grid(asked.grid, asked.change, asked.testing)
     cells = narrow(grid.cells(), asked.only)
     check_cells(cells, asked.grid)
-    # Before the plan is made, which may decode sets for minutes.
+    # Check before planning, which may decode datasets for minutes.
     for place in (asked.out, asked.data or asked.out):
         refuse_no_folder(place)
     refuse_kept(asked.out)
     folder = SweepFolder(asked.out)
-    own = [str(Path(asked.grid).resolve())] * (asked.grid not in names())  # another file is another grid
+    own = [str(Path(asked.grid).resolve())] * (asked.grid not in names())  # a different file is a different grid
     name = plan_name(grid.name, [*own, *asked.only, *asked.change, *["testing"] * asked.testing])
     kept, sets = runs_kept(asked.done), asked.data or asked.out / DATA
     jobs, warnings = plan_jobs(cells, asked.out, sets, kept, folder.jobs_of_others(name))
@@ -106,7 +106,7 @@ def run(words: list[str], program: str) -> None:
 
 
 def _print_plan(jobs: list[Job], stack: int) -> None:
-    """Every job as one line of shell, what is shared, and how many processes that makes."""
+    """Print each job as one shell line, shared jobs, and the number of processes."""
     from vd4rl_pomdp.sweeps.driver import in_stacks
 
     users = Counter(name for job in jobs for name in job.needs)
@@ -124,14 +124,14 @@ def _print_plan(jobs: list[Job], stack: int) -> None:
 
 
 def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
-    """Run plans to their end on an executor of a kind; SystemExit 1 if some jobs are not finished.
+    """Run plans to their end; SystemExit 1 if some jobs are not finished.
 
     Args:
-        plans: their jobs each come after those they need.
-        folder: the sweep's.
+        plans: plans whose jobs are in dependency order.
+        folder: the sweep's folder.
         kind: name of the executor.
         options: its options.
-        name: of the plan; empty: several are all that the folder has.
+        name: name of the plan; empty for all plans in the folder.
     """
     from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
     from vd4rl_pomdp.sweeps.driver import Driver
@@ -160,7 +160,7 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
 
 @command
 def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
-    """Show where a sweep stands: counts, rate, time left, and failures with their error and log.
+    """Show a sweep's progress: counts, rate, time left, and failures with their error and log.
 
     Args:
         out: Folder of the sweep.
@@ -179,20 +179,20 @@ def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RetryCommand(_ExecutorConfig):
-    """Take up the failures of a sweep again, and whatever else is left of its grids."""
+    """Retry a sweep's failed jobs, and run the unfinished ones."""
 
     out: tyro.conf.Positional[Path] = Path()
     """Folder of the sweep."""
 
 
 def retry(words: list[str], program: str) -> None:
-    """Run failures again."""
+    """Retry failed jobs."""
     from vd4rl_pomdp.sweeps.folder import SweepFolder, failed, jobs_of
 
     asked = parse_stage(RetryCommand, words, program)
     folder = SweepFolder(asked.out)
     plans = folder.plans_to_do()
-    # A row, not a deletion: other drivers may be reading the file.
+    # Append a row instead of deleting some: other drivers may be reading the file.
     for name, rows in folder.attempts(jobs_of(plans)).items():
         if failed(rows):
             folder.forget(name)
@@ -208,17 +208,17 @@ def join(
     threads: int = 0,
     stack: int = 1,
 ) -> None:
-    """Help with a sweep on this machine: take jobs that nobody has, and end when there is none to take.
+    """Help with a sweep on this machine: run jobs that nobody else runs, and exit when there are none left.
 
-    What a task of Slurm or Ray does; on any other cluster, start it as often as you like.
+    Slurm and Ray tasks do this; on any other cluster, start as many as you like.
 
     Args:
         out: Folder of the sweep.
-        plan: Jobs of this plan alone; default: all that lie in OUT/sweep/plans.
-        jobs: Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU.
-        jobs_per_gpu: Jobs at a time on each GPU.
-        threads: CPU threads of a job; 0: its share of the machine's cores.
-        stack: Most fine-tunings that one process trains as a stack, in the place of one job.
+        plan: Run only this plan's jobs; default: all plans in OUT/sweep/plans.
+        jobs: Concurrent jobs on this machine; 0: as many as its GPUs take, or one without a GPU.
+        jobs_per_gpu: Concurrent jobs per GPU.
+        threads: CPU threads per job; 0: its share of the cores.
+        stack: Maximum fine-tunings that one process trains as a stack, in the place of one job.
     """
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder

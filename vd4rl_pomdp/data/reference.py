@@ -11,6 +11,7 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.reading import build
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.dataset import Dataset
 from vd4rl_pomdp.policies.actor import shipped_file
 from vd4rl_pomdp.runs import REFERENCE_FILE
@@ -85,7 +86,7 @@ def action_error(action: np.ndarray, shown: np.ndarray) -> np.floating:
 def _sole_actor(dataset: Dataset) -> dict[str, str] | None:
     """The shipped actor that collected all shards; None if there is no such single actor."""
     hashes = {one.get("actor_sha256") for one in dataset.store.meta["attributes"]}
-    if len(hashes) != 1 or dataset.task is None:
+    if len(hashes) != 1 or dataset.task not in TASKS:
         return None
     sha256 = str(hashes.pop())
     for quality in ("medium", "expert"):

@@ -475,7 +475,7 @@ def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
                 for seed in (seed for seed in seeds if seed not in own):
                     run = there.get((*place, *method, variant, seed))
                     if run is None or not run.evaluated:
-                        state = MISSING if run is None or run.finished else run.progress
+                        state = MISSING if run is None else "not evaluated" if run.finished else run.progress
                         values = (*place, *method, variant)
                         rows.append(dict(zip(CONDITION, values, strict=True)) | {"seed": seed, "state": state})
     rows = [row for row in rows if choice.asks(row)]

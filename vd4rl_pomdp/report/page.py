@@ -76,10 +76,8 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     runs = load_runs(paths, out, choice)
     results = [run.result for run in runs]
     refuse_loss(results, out)  # check early: drawing takes most of the time
-    if not any(run.rows for run in runs):
-        mazes = all(run.stage == "navigation" for run in runs)
-        told = "`vd4rl-pomdp navigation report` reports its mazes" if mazes else "`vd4rl-pomdp finetune` evaluates"
-        raise UserError(f"{paths[0]}: holds no evaluated run yet; {told}")
+    if all(run.stage == "navigation" for run in runs):
+        raise UserError(f"{paths[0]}: holds no evaluated run; `vd4rl-pomdp navigation report` reports its mazes")
     certificates = certificates_of(results, paths, None if out in paths else out)
     made, judged, claimed = _tables(runs, choice, verdicts(runs, certificates))
     shown = shown_tables(made)

@@ -1,14 +1,14 @@
-"""`vd4rl-pomdp certify`: does a set under a corruption need a memory of what was seen?
+"""`vd4rl-pomdp certify`: does a dataset under a corruption need a memory of past observations?
 
-The grid `certify` trains, each told the simulator's states:
+The grid `certify` trains on the simulator's states, with:
 
-    supervised+a          a memory of pixels and actions
+    supervised+a          a memory of observations and actions
     supervised_picture    one observation, no memory
-    integrator            the first observation, the actions since and the time
-    state                 nothing is hidden: whether data and budget suffice
+    integrator            the first observation, all actions since and the time
+    state                 the state itself: whether data and budget suffice
 
-What each is worth is R^2 of the states in episodes that neither encoder nor probe was trained on, and, if asked for,
-what a policy on it returns. A memory of what was seen is needed where the first exceeds the second and the third.
+Each is scored by R^2 of the states in episodes held out from encoder and probe, and optionally by the returns of a
+policy. Such a memory is needed if the first scores above the second and the third.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ GRID = "certify"
 MEMORY, FLOORS, STATE = "supervised+a", ("supervised_picture", "integrator"), "state"
 NEEDS, NEEDS_NOT, OPEN = "needs a memory of what was seen", "needs no memory of what was seen", "undecided"
 MARGIN = 0.05
-"""A memory that is known to add less, in R^2 or as a share of the data's mean return, is not needed."""
+"""Memory is not needed if it surely adds less than this, in R^2 or as a fraction of the data's mean return."""
 ENOUGH = 0.5
-"""A memory that is worth less itself, likewise, may lack budget: that it adds nothing is then no verdict."""
+"""Minimum score of the memory itself for that verdict, in the same units; below, the budget may be too small."""
 R2_FILE = "r2.json"
-"""R^2 in every held-out episode, in the folder of a pretraining."""
+"""R^2 per held-out episode, in a pretraining run's folder."""
 
 
 def planned(
     data: Path, corruption: str, out: Path, returns: bool, changes: Sequence[str]
 ) -> tuple[Dataset, list[GridCell], list[Job]]:
-    """The set, the grid's cells for it, and their trainings, each after the one that it needs.
+    """The dataset, its cells of the grid, and their jobs in dependency order.
 
     Args:
-        data: folder of a set with simulator states.
+        data: folder of a dataset with simulator states.
         corruption: name of a corruption.
         out: folder of the runs, OUT/METHOD/seedN/STAGE.
-        returns: whether policies are trained, too.
-        changes: settings of the grid's trainings, "pretrain.steps=100" or "seed=0,1".
+        returns: whether to train policies as well.
+        changes: overrides for the grid, e.g. "pretrain.steps=100" or "seed=0,1".
     """
     dataset = open_dataset(data)
     dataset.require_states()
@@ -87,7 +87,7 @@ def planned(
 
 
 def place_of(cell: GridCell) -> str:
-    """Where the runs of a cell go, below the folder of all."""
+    """Folder of a cell's runs, below the common one."""
     return f"{cell.value('method')}/seed{cell.seed}"
 
 
@@ -104,7 +104,7 @@ def _jobs(cell: GridCell, data: Path, out: Path) -> Iterator[Job]:
 
 
 def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: bool) -> Row:
-    """The certificate of finished runs; it is kept in their folder and in the set's."""
+    """Make the certificate of finished runs; it is saved in their folder and in the dataset's."""
     places = {method: [place_of(cell) for cell in mine] for method, mine in groups(cells, _method).items()}
     measured = {
         "R2": judge({name: _r2(dataset, [out / place for place in places[name]]) for name in (MEMORY, *FLOORS)}, 1, 2)
@@ -135,7 +135,7 @@ def _method(cell: GridCell) -> str:
 
 
 def _r2(dataset: Dataset, places: Sequence[Path]) -> np.ndarray:
-    """(seeds, held-out episodes) of the encoders at some places."""
+    """(seeds, held-out episodes): R^2 of the encoders in some folders."""
     for place in places:
         if not (file := place / "pretrain" / R2_FILE).exists():
             write_json(file, {"r2": held_out_r2(place / "pretrain" / "encoder", dataset)})
@@ -143,11 +143,11 @@ def _r2(dataset: Dataset, places: Sequence[Path]) -> np.ndarray:
 
 
 def held_out_r2(folder: Path, dataset: Dataset) -> list[float]:
-    """R^2 of poses and velocities in every held-out episode, by a linear probe of an encoder's states.
+    """R^2 of poses and velocities in every held-out episode, by a linear probe on an encoder's states.
 
     Args:
-        folder: the encoder's, which was pretrained on the set with `hold_out`.
-        dataset: the set; it is moved to a GPU if there is one.
+        folder: the encoder's, pretrained on the dataset with `hold_out`.
+        dataset: the dataset; moved to a GPU if there is one.
     """
     encoder, card = load_encoder(folder, dataset.task, dataset.action_dim, dataset.frame_size)
     device = pick_device("auto")
@@ -160,7 +160,7 @@ def held_out_r2(folder: Path, dataset: Dataset) -> list[float]:
 
 
 def _returns(folders: Sequence[Path]) -> Row:
-    """What the policies of some folders return, and what that says."""
+    """Verdict from the policies' returns, undecided if `state` returns too little or critics have not converged."""
     runs = load_runs(folders)
     data = np.mean([run.reference.data_return for run in runs])
     found = {method: episodes_of(mine) for method, mine in groups(runs, lambda run: run.method).items()}
@@ -176,12 +176,12 @@ def _returns(folders: Sequence[Path]) -> Row:
 
 
 def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
-    """Whether the memory is above both floors.
+    """Verdict: whether the memory scores above both floors.
 
     Args:
         values: (seeds, episodes) by method.
-        unit: what MARGIN and ENOUGH are shares of.
-        digits: of numbers in words.
+        unit: unit of MARGIN and ENOUGH.
+        digits: decimals in the text.
     """
     row: Row = {"methods": {}, "above": {}}
     for name, scores in values.items():

@@ -22,7 +22,7 @@ from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, 
 
 DIM, ACTIONS, SIZE = 3, 2, 32
 UPDATES = 4
-"""Enough for an algorithm with delayed updates to step along each of its losses twice."""
+"""Enough that an algorithm with delayed updates optimises each of its losses twice."""
 
 
 def check_algorithm(name: str, **options: Any) -> None:
@@ -40,7 +40,7 @@ def check_algorithm(name: str, **options: Any) -> None:
 
 
 def batch(number: int = 0) -> FeatureBatch:
-    """Random transitions, every other one of which is terminal."""
+    """Random transitions; every other one is terminal."""
     g = torch.Generator().manual_seed(number)
     z, next_z = (5 + 3 * torch.randn(SIZE, DIM, generator=g) for _ in range(2))
     action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
@@ -117,7 +117,8 @@ def _moved(before: dict[str, Tensor], after: dict[str, Tensor]) -> set[str]:
 
 
 def losses_are_finite_scalars(name: str, **options: Any) -> None:
-    """Losses are finite scalars; an update returns all their logs: detached scalars, distinct names, none `step`."""
+    """Losses are finite scalars; an update returns all their logs as detached scalars with distinct names, none
+    `step`."""
     algorithm = make(name, **options)
     for number in range(UPDATES):
         steps, logs = watched(algorithm, batch(number))
@@ -132,7 +133,8 @@ def losses_are_finite_scalars(name: str, **options: Any) -> None:
 
 
 def a_loss_moves_what_its_optimiser_steps(name: str, **options: Any) -> None:
-    """A loss reaches all that its optimiser steps, and the step moves nothing else; all of the policy's net moves."""
+    """A loss has a gradient to all parameters of its optimiser; its step changes only those; all of the policy is
+    trained."""
     algorithm = make(name, **options)
     policy_moved: set[str] = set()
     for number in range(UPDATES):
@@ -153,7 +155,7 @@ def a_loss_moves_what_its_optimiser_steps(name: str, **options: Any) -> None:
 
 
 def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) -> None:
-    """The first loss, which trains the encoder where none is frozen, has a gradient to `batch.z`, and no other has.
+    """Only the first loss, which trains an encoder that is not frozen, has a gradient to `batch.z`.
 
     The encoder's optimiser steps along it.
     """
@@ -170,7 +172,7 @@ def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) 
 
 
 def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) -> None:
-    """Parts called `target_x` move by the share `tau` of the way to x; nothing else moves but by steps along losses."""
+    """A `target_x` moves towards x by a factor `tau` per update; everything else changes only by optimiser steps."""
     algorithm = make(name, **options)
     targets = {part: module for part, module in _modules(algorithm).items() if part.startswith("target_")}
     with torch.no_grad():
@@ -192,7 +194,8 @@ def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) ->
 
 
 def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **options: Any) -> None:
-    """An algorithm that takes over another's state takes the other's steps, to the bit, whatever torch draws itself."""
+    """After loading a state dict, an algorithm takes bit-identical steps, independent of torch's global random
+    state."""
     one, other = (make(name, seed=seed, **options) for seed in (0, 1))
     for number in range(3):
         one.update(batch(number))
@@ -209,7 +212,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
 
 
 def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
-    """Make an algorithm permute the rows of every batch: the same mathematics in another order of summation."""
+    """Make an algorithm permute the rows of every batch: the same mathematics, summed in another order."""
 
     def each(function: Callable[..., Any], given: FeatureBatch, *tensors: Tensor) -> Any:
         order = torch.randperm(len(given.z), generator=torch.Generator().manual_seed(seed)).to(given.z.device)
@@ -225,11 +228,12 @@ def farther_than_rounding(
     single: Callable[[Callable[[Algorithm], Algorithm]], Mapping[str, Tensor]],
     times: float = 4.0,
 ) -> list[str]:
-    """Tensors that differ from those of a single run by more than rounding explains, with the differences.
+    """Tensors that differ from a single run's by more than rounding explains, and by how much.
 
     Args:
-        found: the tensors by name.
-        single: runs a single run anew and returns its tensors; its argument modifies the algorithm before it starts.
+        found: tensors by name.
+        single: repeats a single run and returns its tensors; its argument modifies the algorithm before the first
+            step.
         times: tolerance, in multiples of the largest change by three other summation orders or float32's epsilon.
     """
     expected = single(lambda algorithm: algorithm)
@@ -247,7 +251,7 @@ def farther_than_rounding(
 
 
 def course(algorithm: Algorithm, logs: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Final state tensors, and each logged scalar's series as one tensor."""
+    """Final state tensors, and the series of each logged scalar as one tensor."""
     series: dict[str, list[Tensor]] = {}
     for row in logs:
         for key, value in row.items():
@@ -256,7 +260,7 @@ def course(algorithm: Algorithm, logs: list[dict[str, Tensor]]) -> dict[str, Ten
 
 
 def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
-    """Runs trained as one, which Python sees one `update` of, take each one's own steps but for rounding."""
+    """Each run in a stack takes the same steps as it does alone, up to rounding."""
     seeds, updates = range(3), 5 * UPDATES
     runs = [make(name, seed, **options) for seed in seeds]
     whole = Stack(runs)
@@ -280,7 +284,7 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
 
 
 def actions_lie_within_their_bounds(name: str, **options: Any) -> None:
-    """The policy's actions lie in [-1, 1], however far a representation is from those of the training."""
+    """Actions lie in [-1, 1], even for representations far outside the training distribution."""
     algorithm = make(name, **options)
     for number in range(UPDATES):
         algorithm.update(batch(number))
@@ -290,7 +294,7 @@ def actions_lie_within_their_bounds(name: str, **options: Any) -> None:
 
 
 def a_batch_is_left_as_it_was(name: str, **options: Any) -> None:
-    """An update changes nothing in the batch that it is given."""
+    """An update does not modify its batch."""
     given = batch()
     make(name, **options).update(given)
     changed = [f.name for f in fields(FeatureBatch) if not torch.equal(given[f.name], batch()[f.name])]

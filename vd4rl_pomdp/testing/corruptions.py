@@ -59,7 +59,7 @@ def _make(name: str, options: dict[str, Any]) -> Corruption:
 
 
 def pixels_stay_pixels(name: str, **options: Any) -> None:
-    """A corrupted batch is a new one of the same shape, uint8; what was given stays as it was."""
+    """A corruption returns a new uint8 tensor of the same shape and leaves its input unchanged."""
     obs = stacks()
     out = _make(name, options)(obs, torch.arange(STACKS))
     claim(out.dtype == torch.uint8, f"it is {out.dtype}")
@@ -68,13 +68,13 @@ def pixels_stay_pixels(name: str, **options: Any) -> None:
 
 
 def something_changes(name: str, **options: Any) -> None:
-    """A corruption changes pixels; the one called `none` changes none."""
+    """A corruption changes pixels; `none` changes nothing."""
     changed = not torch.equal(_make(name, options)(stacks(), torch.arange(STACKS)), stacks())
     claim(changed == (name != "none"), f"of {STACKS} random stacks {'some differ' if changed else 'none differs'}")
 
 
 def equal_keys_give_equal_masks(name: str, **options: Any) -> None:
-    """A stack and its key decide what is seen, whatever else is in the batch and however that is shaped."""
+    """The output for a stack depends on the stack and its key only, not on the rest of the batch or its shape."""
     obs, key, corruption = stacks(), torch.arange(100, 100 + STACKS), _make(name, options)
     whole = corruption(obs, key)
     alone = torch.cat([corruption(obs[i : i + 1], key[i : i + 1]) for i in range(STACKS)])
@@ -84,7 +84,7 @@ def equal_keys_give_equal_masks(name: str, **options: Any) -> None:
 
 
 def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
-    """Nothing is drawn but from the keys: another call, or another seed of torch and numpy, changes nothing."""
+    """Randomness comes from the keys only: repeated calls and other torch or numpy seeds give the same pixels."""
     seen = []
     for seed in (1, 2):
         torch.manual_seed(seed)
@@ -95,7 +95,7 @@ def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
 
 
 def frames_that_are_dropped_stay_dropped(name: str, **options: Any) -> None:
-    """Where a frame is dropped, nothing is drawn into it, and what it held changes no other frame."""
+    """Dropped frames stay black, and their content does not leak into other frames."""
     if name == "none":
         return
     drops = isinstance(CorruptionConfig.of(name, **options).stages[-1], FrameDrop)
@@ -115,7 +115,7 @@ def _frames(obs: Tensor) -> Tensor:
 
 
 def emission_never_changes_a_row(name: str, **options: Any) -> None:
-    """Runs of one seed see equal masks; under `emission` a row has one, whenever it is seen."""
+    """Runs with equal seeds see equal masks; under `emission` a row always has the same mask."""
     row = torch.arange(STACKS)
     always = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 0)
     claim(torch.equal(always(stacks(), row), always(stacks(), row)), "a row looked otherwise when it came again")
@@ -125,7 +125,7 @@ def emission_never_changes_a_row(name: str, **options: Any) -> None:
 
 
 def the_environment_shows_what_the_data_show(name: str, **options: Any) -> None:
-    """Row t of an episode is corrupted alike in a batch of data and in the environment, where it comes alone."""
+    """Row t of an episode gets the same corruption in a batch of data and in the environment."""
     rows = row_key(torch.tensor([0, 0, 1, 1]), torch.tensor([5, 6, 0, 1]))
     data = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 7)(stacks(4), rows)
     environment, seed = _make(name, options), stream_seed(7, "corruption", "emission")
@@ -135,7 +135,7 @@ def the_environment_shows_what_the_data_show(name: str, **options: Any) -> None:
 
 
 def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> None:
-    """The fast path by which a set is read shows what the corruption makes of shifted stacks."""
+    """The fast data path equals shifting the stacks and then corrupting them."""
     with TemporaryDirectory() as folder:
         dataset = _random_set(Path(folder))
         for mode in _MODES:

@@ -51,7 +51,8 @@ def pictures(count: int, size: int = FRAME_SIZE) -> Tensor:
 
 
 def features_have_one_shape(name: str, **options: Any) -> None:
-    """Pictures (..., C, S, S), uint8 or float of 0 to 255, become finite features (..., feature_dim) float32."""
+    """Frame encoders map images (..., C, S, S), uint8 or float in [0, 255], to finite float32 features (...,
+    feature_dim)."""
     encoder, size = make(name, **options), options["size"]
     frame, width, obs = encoder.frame, encoder.config.feature_dim, pictures(6, size)
     assert isinstance(frame, FrameEncoder)
@@ -65,7 +66,7 @@ def features_have_one_shape(name: str, **options: Any) -> None:
 
 
 def pictures_are_not_mixed(name: str, **options: Any) -> None:
-    """A picture's features depend on all of it that is seen and on no other picture of the batch, trained or not."""
+    """The features of an image depend on that image alone, not on the rest of the batch, in train and eval mode."""
     obs = pictures(3, options["size"]).float().requires_grad_()
     for training in (False, True):
         features = make(name, **options).frame.train(training)(obs)
@@ -77,7 +78,7 @@ def pictures_are_not_mixed(name: str, **options: Any) -> None:
 
 
 def gradients_reach_all_parameters(name: str, **options: Any) -> None:
-    """A loss on the features moves every parameter but those that are frozen (`requires_grad` False)."""
+    """A loss on the features has a gradient to every parameter with `requires_grad`."""
     frame = make(name, **options).frame
     features = frame(pictures(3, options["size"]))
     (features * torch.randn(features.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
@@ -90,7 +91,7 @@ def _moves(value: torch.nn.Parameter) -> bool:
 
 
 def a_seed_decides_everything(name: str, **options: Any) -> None:
-    """Built from one seed of torch, encoders are equal; the same pictures always give the same features."""
+    """The torch seed determines the weights, and the features of an image are deterministic."""
     one, other, obs = make(name, **options), make(name, **options), pictures(2, options["size"])
     state = other.state_dict()
     differing = [key for key, value in one.state_dict().items() if not torch.equal(value, state[key])]
@@ -102,7 +103,7 @@ def a_seed_decides_everything(name: str, **options: Any) -> None:
 
 
 def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
-    """Saved as a folder and loaded, an encoder has its options and gives the same features."""
+    """Saving and loading an encoder preserves its options and features."""
     encoder, obs = make(name, **options).eval(), pictures(2, options["size"])
     with TemporaryDirectory() as folder:
         save_encoder(Path(folder), encoder, EncoderCard("curl", "", "", {"corruption": "none"}, 0, 0, "smoke"))

@@ -39,7 +39,7 @@ def check_memory(name: str, **options: Any) -> None:
 
 
 def make(name: str, **options: Any) -> Memory:
-    """The memory for rows of INPUTS numbers, the last two of which are an action; identical at every call."""
+    """The memory for rows of INPUTS numbers, of which the last two are an action; identical at every call."""
     torch.manual_seed(0)
     return make_memory(name, INPUTS, {"hidden_dim": _WIDTH} | options, INPUTS - 2)
 
@@ -67,7 +67,8 @@ def windows() -> Windows:
 
 
 def outputs_have_one_shape(name: str, **options: Any) -> None:
-    """Rows (B, T, I) become finite (B, T, hidden_dim) in the precision of the weights, under bf16 autocast, too."""
+    """Memories map rows (B, T, I) to finite (B, T, hidden_dim) in the dtype of the weights, also under bf16
+    autocast."""
     memory = make(name, **options)
     before, width = memory.initial_state(BATCH), ({"hidden_dim": _WIDTH} | options)["hidden_dim"]
     claim(before.dim() == 3 and before.shape[1] == BATCH, f"its initial state is {tuple(before.shape)}, not (L, B, W)")
@@ -81,7 +82,7 @@ def outputs_have_one_shape(name: str, **options: Any) -> None:
 
 
 def streaming_equals_batch(name: str, **options: Any) -> None:
-    """Row by row an encoder gives what it gives for whole windows, with and without actions, over all rows or three."""
+    """Encoding row by row equals encoding whole windows, with and without actions, for full and three-row histories."""
     for method in _METHODS:
         encoder, window = encoder_of(name, **method, **options), windows()
         with torch.no_grad():
@@ -92,9 +93,9 @@ def streaming_equals_batch(name: str, **options: Any) -> None:
 
 
 def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
-    """What is put out at a row has a gradient to that row and to earlier ones of its window, and to nothing else.
+    """An output depends on its own row and on earlier rows of its window only.
 
-    Of a memory with a `reach`, to that many rows at most.
+    For a memory with a `reach`, on that many rows at most.
     """
     # in float64, so that small gradients across many rows do not underflow
     memory, x = make(name, **options).double(), rows().double().requires_grad_()
@@ -111,7 +112,7 @@ def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
 
 
 def actions_are_read_where_a_method_has_them(name: str, **options: Any) -> None:
-    """s_t of "+a" changes with each action before row t, that of other methods with none."""
+    """s_t depends on all actions before row t for "+a" methods, and on no action for others."""
     for method, reads in (("mik+a", True), ("mik", False)):
         encoder, window = encoder_of(name, method=method, **options), windows()
         changed = window.prev_action.clone()
@@ -125,7 +126,7 @@ def actions_are_read_where_a_method_has_them(name: str, **options: Any) -> None:
 
 
 def observations_are_read_where_it_says(name: str, **options: Any) -> None:
-    """s_t changes with o_t or, of a memory with `first_only`, with o_0 alone; never with a later observation."""
+    """s_t depends on o_t (with `first_only`, on o_0 alone) and never on later observations."""
     for method in ("mik+a", "mik"):
         encoder, window = encoder_of(name, method=method, **options), windows()
         memory = encoder.memory
@@ -144,7 +145,7 @@ def observations_are_read_where_it_says(name: str, **options: Any) -> None:
 
 
 def padding_is_not_read(name: str, **options: Any) -> None:
-    """Read backwards, as MIK's future, a padded window gives what it gives without its padding."""
+    """Run backwards, as for MIK's future encoder, padding does not change the outputs."""
     memory, x, length = make(name, **options), rows(), torch.tensor([ROWS, 4, 1])
     with torch.no_grad():
         padded = run_backward(memory, x, length)
@@ -154,7 +155,7 @@ def padding_is_not_read(name: str, **options: Any) -> None:
 
 
 def gradients_reach_all_parameters(name: str, **options: Any) -> None:
-    """A loss on what is put out moves every parameter."""
+    """A loss on the outputs has a gradient to every parameter."""
     memory = make(name, **options)
     out, _ = run_memory(memory, rows())
     (out * torch.randn(out.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
@@ -163,7 +164,7 @@ def gradients_reach_all_parameters(name: str, **options: Any) -> None:
 
 
 def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
-    """Built from one seed memories are equal; saved as a folder and loaded, one gives the same states."""
+    """The seed determines the weights; saving and loading an encoder preserves its states."""
     encoder, window = encoder_of(name, **options), windows()
     with TemporaryDirectory() as folder:
         save_encoder(Path(folder), encoder, EncoderCard("mik+a", "", "", {"corruption": "none"}, 0, 0, "smoke"))

@@ -23,9 +23,10 @@ from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, 
 ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
 _SMALLEST = {"max_k": 4, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
-"""For visibility checks, which take a backward pass per pair; with fewer units all ReLUs of the head may be zero."""
+"""Sizes for visibility checks, which take a backward pass per pair; with fewer units all ReLUs of the head may be
+zero."""
 _PICTURE, _GRID = (9, 84), (9, 2)
-"""Channels and image size: the benchmark's, and a tiny one for the frame encoder `flat`."""
+"""Channels and image size: the benchmark's, and tiny ones for the frame encoder `flat`."""
 
 
 def check_method(name: str, **settings: Any) -> None:
@@ -60,7 +61,7 @@ def build(name: str, **settings: Any) -> Objective:
 
 
 def build_inverse(name: str, **settings: Any) -> InverseObjective:
-    """An inverse model in float64, small enough to perturb each input; by default its frame encoder is `flat`."""
+    """An inverse model in float64, small enough to perturb each input; its default frame encoder is `flat`."""
     settings = {"frame_encoder": "flat"} | settings
     observation = _GRID if settings["frame_encoder"] == "flat" else _PICTURE
     return cast(InverseObjective, _build(name, _SMALLEST, observation, settings).double())
@@ -89,7 +90,7 @@ def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool
 
 
 def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0) -> Windows:
-    """`batch` as in the method's training: with random simulator states if it regresses them."""
+    """`batch` as the method sees it in training: with random simulator states if it regresses them."""
     plain = batch(lengths, seed)
     if not METHODS.named(name).regresses_state:
         return plain
@@ -98,7 +99,7 @@ def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0
 
 
 def streaming_equals_batch(name: str, **settings: Any) -> None:
-    """Row by row, as the environment delivers them, an encoder gives what it gives for whole windows."""
+    """Encoding row by row, as in the environment, equals encoding whole windows."""
     encoder = build(name, **settings).encoder.eval()
     window = batch((ROWS, ROWS), state=METHODS.named(name).reads_state)
     with torch.no_grad():
@@ -113,7 +114,7 @@ def streaming_equals_batch(name: str, **settings: Any) -> None:
 
 
 def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
-    """A loss is a finite scalar, and what is logged are detached scalars, the loss among them."""
+    """The loss is a finite scalar; the logs are detached scalars and contain `loss`."""
     loss, logs = build(name, **settings).loss(windows(name), 0.0)
     claim(loss.shape == (), f"its shape is {tuple(loss.shape)}")
     claim(torch.isfinite(loss), f"it is {loss.item()}")
@@ -125,7 +126,7 @@ def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
 
 
 def a_loss_moves_the_whole_encoder(name: str, **settings: Any) -> None:
-    """A loss has a gradient to every parameter of the encoder."""
+    """The loss has a gradient to every parameter of the encoder."""
     objective = build(name, **settings)
     objective.loss(windows(name), 0.0)[0].backward()
     still = [n for n, p in objective.encoder.named_parameters() if p.grad is None or not p.grad.any()]
@@ -133,7 +134,7 @@ def a_loss_moves_the_whole_encoder(name: str, **settings: Any) -> None:
 
 
 def steps_lower_the_loss(name: str, **settings: Any) -> None:
-    """Steps along the loss of one batch lower it: by 3% within 30 of them."""
+    """30 optimiser steps on one batch lower its loss by at least 3%."""
     objective = build(name, **settings)
     losses = _train(name, objective, torch.optim.Adam(objective.parameters(), lr=1e-3), [0] * 30)
     first, last = sum(losses[:5]) / 5, sum(losses[-5:]) / 5
@@ -154,7 +155,7 @@ def _train(name: str, objective: Objective, optimiser: torch.optim.Optimizer, ba
 
 
 def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings: Any) -> None:
-    """A training that goes on from its saved state takes the steps of one that was never cut, whatever torch draws."""
+    """After restoring a checkpoint, training continues bit-identically, independent of torch's global random state."""
     here = build(name, **settings)
     optimiser = torch.optim.Adam(here.parameters(), lr=1e-3)
     _train(name, here, optimiser, range(2))
@@ -186,7 +187,7 @@ def _elsewhere(name: str, objective: Objective, **settings: Any) -> Objective:
 
 
 def padding_changes_no_loss(name: str, **settings: Any) -> None:
-    """What stands in the rows behind a window's end changes no loss."""
+    """Padding does not change the loss."""
     objective, window = build(name, **settings), windows(name, (4, 4, 4))
     noisy = window.replace(obs=window.obs.clone(), action=window.action.clone(), prev_action=window.prev_action.clone())
     noisy.obs[:, 4:], noisy.action[:, 4:], noisy.prev_action[:, 5:] = 255, 7.0, 7.0
@@ -207,7 +208,8 @@ def every_action_target_is_taken(name: str, **settings: Any) -> None:
 
 
 def optional_terms_are_added(name: str, **settings: Any) -> None:
-    """Self-prediction and the norm of states add to the loss by their weights, and a head need not be told k."""
+    """Self-prediction and the norm of states add to the loss with their weights; `--no-k-embedding` removes k from
+    the head."""
     terms = {"self_prediction": 0.5, "l2_states": 0.1}
     rich = cast(InverseObjective, build(name, **(settings | terms | {"k_embedding": False})))
     plain = cast(InverseObjective, build(name, **(settings | dict.fromkeys(terms, 0.0) | {"k_embedding": False})))
@@ -222,7 +224,8 @@ def optional_terms_are_added(name: str, **settings: Any) -> None:
 
 
 def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: Any) -> None:
-    """`action_loss` is the mean of -log P(a_t | ...) over all real pairs (t, t+k), and `loss_kNN` over those of a k."""
+    """`action_loss` is the mean of -log P(a_t | ...) over all real pairs (t, t+k), and `loss_kNN` the mean for one
+    k."""
     objective, window = cast(InverseObjective, build(name, **settings)), batch()
     logits = copy.deepcopy(objective).action_logits(window)  # a copy, so that the loss below makes the same draws
     alone: dict[int, list[torch.Tensor]] = {}
@@ -238,13 +241,13 @@ def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: An
 
 
 def predictions_depend_on_what_is_declared(name: str, **settings: Any) -> None:
-    """The prediction of each pair depends on all that `visible` and `visible_frames` declare, and on nothing else."""
+    """The prediction for each pair depends on exactly the inputs that `visible` and `visible_frames` declare."""
     for training in (False, True):  # batch norm mixes rows only in training mode
         claim_visibility(build_inverse(name, **settings).train(training), [ROWS, ROWS, 4], ROWS)
 
 
 def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int) -> None:
-    """Raise AssertionError with the first failing pair unless an objective depends on exactly what it declares."""
+    """Raise AssertionError with the first failing pair unless the predictions depend on exactly what is declared."""
     for frames in (False, True):
         wrong = wrong_pairs(objective, lengths, rows, frames)
         if not wrong:
@@ -269,7 +272,7 @@ TRAINED: tuple[Check, ...] = (
     a_training_that_goes_on_elsewhere_takes_the_same_steps,
     padding_changes_no_loss,
 )
-"""For methods that are trained."""
+"""For trained methods."""
 INVERSE: tuple[Check, ...] = (
     every_action_target_is_taken,
     optional_terms_are_added,

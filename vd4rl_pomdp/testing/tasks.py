@@ -18,7 +18,7 @@ DECISIONS = 12
 
 
 def check_task(name: str) -> None:
-    """Run all checks on a task, by playing a few short episodes.
+    """Run all checks on a task by playing a few short episodes.
 
     Args:
         name: name in `vd4rl_pomdp.core.tasks.TASKS`.
@@ -37,7 +37,7 @@ def make(name: str, size: int | None = None, length: int = DECISIONS) -> PixelEn
 
 
 def play(env: PixelEnv, seed: int) -> tuple[list[TimeStep], np.ndarray]:
-    """Play a seed's episode with fixed random actions; returns its rows and the actions (T, A) float32."""
+    """Play one episode with fixed random actions; returns its rows and the actions (T, A) float32."""
     rng = np.random.default_rng(0)
     rows: list[TimeStep] = [env.reset(seed)]
     actions: list[np.ndarray] = []
@@ -49,7 +49,7 @@ def play(env: PixelEnv, seed: int) -> tuple[list[TimeStep], np.ndarray]:
 
 
 def episodes_repeat_from_their_seeds(name: str) -> None:
-    """A seed and the actions decide an episode, in a used environment and in a fresh one."""
+    """Seed and actions determine an episode, in a used and in a new environment."""
     env = make(name, SIZES[1])
     first, _ = play(env, 3)
     play(env, 4)
@@ -62,7 +62,7 @@ def episodes_repeat_from_their_seeds(name: str) -> None:
 
 
 def frames_have_the_size_asked_for(name: str) -> None:
-    """Frames are (3, S, S) uint8 of any size S."""
+    """Frames are (3, S, S) uint8 for any size S."""
     for size in SIZES:
         for row in play(make(name, size, length=2), 0)[0]:
             assert row.frame is not None
@@ -71,7 +71,7 @@ def frames_have_the_size_asked_for(name: str) -> None:
 
 
 def frames_stay_as_they_were(name: str) -> None:
-    """A row keeps its frame while the environment goes on."""
+    """Later steps do not overwrite earlier frames."""
     env = make(name, SIZES[0])
     first = env.reset(3).frame
     assert first is not None
@@ -81,7 +81,7 @@ def frames_stay_as_they_were(name: str) -> None:
 
 
 def rows_have_the_declared_widths(name: str) -> None:
-    """Rows hold states of the task's layout, which is that of its environment, and finite rewards, 0 in the first."""
+    """States match the declared layout; rewards are finite, and 0 in the first row."""
     task = TASKS.named(name)
     found = layout_of(replace(task, layout=None))
     claim(layout_of(task) == found, f"its layout says {task.layout}, the environment has {found}")
@@ -100,7 +100,7 @@ def rows_have_the_declared_widths(name: str) -> None:
 
 
 def episodes_end_once(name: str) -> None:
-    """Step types are FIRST, MID and LAST; the limit ends with discount 1, the task itself perhaps with 0, MID never."""
+    """Step types are FIRST, MID, LAST; a time limit ends an episode with discount 1, the task itself with 0 or 1."""
     rows, _ = play(make(name), 0)
     kinds = [row.step_type for row in rows]
     middle = [StepType.MID] * (len(rows) - 2)
@@ -113,7 +113,7 @@ def episodes_end_once(name: str) -> None:
 
 
 def actions_fill_their_bounds(name: str) -> None:
-    """Actions in [-1, 1] reach the environment in its bounds and in their dtype, -1 and 1 as the bounds themselves."""
+    """Actions in [-1, 1] are rescaled to the environment's bounds and dtype; -1 and 1 map to the bounds exactly."""
     for action in (-1.0, -0.7, 0.0, 0.3, 1.0):
         env = make(name)
         env.reset(0)
@@ -143,14 +143,14 @@ def _given(env: PixelEnv, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def rewards_replay(name: str) -> None:
-    """Where simulator states are stored and are all that an episode begins with, rewards replay from the first one."""
+    """Rewards replay exactly from the first simulator state, where it is stored and determines the episode."""
     from vd4rl_pomdp.envs.dmc import replay_rewards, replays
 
     task = TASKS.named(name)
     if not isinstance(task, DMCTask) or not replays(task):
         return
     env = make(name)
-    for seed in (3, 4):  # the second episode starts in a simulator that was used before
+    for seed in (3, 4):  # the second episode starts in a used simulator
         rows, actions = play(env, seed)
         found, paid = replay_rewards(name, rows[0].physics, actions), [row.reward for row in rows[1:]]
         claim(np.array_equal(found, paid), f"{paid} were paid, {found.tolist()} are replayed")

@@ -1,8 +1,8 @@
-"""Collect a maze's data: shards in V-D4RL's format with frames of 100x100 and the true state of every row.
+"""Collect a maze's dataset: shards in V-D4RL's format with frames of 100x100 and the true state of every row.
 
-Trajectory i depends on (seed, i) alone, whatever the number of workers. Within a trajectory nothing is reset; goals
-are uniform in the free space and move when they are reached. Shards are written whole: re-running the same command
-resumes an interrupted collection and ends in the same files.
+Trajectory i depends only on (seed, i), not on the number of workers. A trajectory has no resets; goals are uniform in
+the free space and move when reached. Shards are written atomically: re-running the same command resumes an interrupted
+collection with identical files.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vd4rl_pomdp.envs.maze import MazeEnv
 
 SAMPLES = 6
-"""Sample observations of a maze."""
+"""Sample observations per maze."""
 _FIRST_SAMPLE, _SAMPLE_STEP = 20, 12
 
 
@@ -43,19 +43,19 @@ class MazeCollectConfig(StageConfig):
     maze: str = ""
     """no_curtain, one_curtain, three_curtains or first_person; compass_first_person; or one of the four after hard_."""
     out: Path = Path()
-    """Folder of the set."""
+    """Folder of the dataset."""
     trajectories: int = 500
-    """Trajectories in all; the last tenth is held out from training."""
+    """Total trajectories; the last tenth is held out from training."""
     trajectory_rows: int = 1000
-    """Rows of each trajectory."""
+    """Rows per trajectory."""
     action_repeat: int = ACTION_REPEAT
-    """Simulator steps of 0.01 s for one action."""
+    """Simulator steps of 0.01 s per action."""
     seed: int = 0
-    """Seed of starts, goals and what is random about actions."""
+    """Seed of starts, goals and action noise."""
     workers: int = 0
-    """Processes that simulate and draw; 0 uses every core."""
+    """Worker processes; 0 uses every core."""
     trajectories_per_shard: int = 5
-    """Trajectories in a shard."""
+    """Trajectories per shard."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {},
@@ -65,7 +65,7 @@ class MazeCollectConfig(StageConfig):
     """500k rows as in the paper, 100k, and 1,200 rows."""
 
     def check(self) -> None:
-        """Raise UserError for settings that make no set."""
+        """Raise UserError for invalid settings."""
         super().check()
         refuse_unknown("--maze", self.maze, MAZES)
         refuse_outside(
@@ -75,7 +75,7 @@ class MazeCollectConfig(StageConfig):
 
 
 def collect(config: MazeCollectConfig) -> list[Path]:
-    """Collect the set, or what is missing of it; returns its shards."""
+    """Collect the dataset, or what is missing of it; returns its shards."""
     config.check()
     refuse_inside(config.out)
     maze, packages = get_maze(config.maze), ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
@@ -101,13 +101,13 @@ def collect(config: MazeCollectConfig) -> list[Path]:
 
 
 def collection(config: MazeCollectConfig) -> dict[str, Any]:
-    """What tells a set from others: the settings in its collection.json."""
+    """Settings that identify a dataset, as in its collection.json."""
     runtime = ("out", "workers", "preset")
     return {name: value for name, value in jsonable(asdict(config)).items() if name not in runtime}
 
 
 def _roll_out(job: tuple[str, int, int, int, int]) -> EpisodeArrays:
-    """Rows of one trajectory, by key, from the maze's name, its number, the seed, its length and the action repeat."""
+    """Roll out one trajectory, by maze, number, seed, rows and action repeat; returns its arrays by key."""
     maze, trajectory, seed, length, action_repeat = job
     env, rng = _environment(maze, action_repeat), np.random.default_rng([seed, trajectory])
     act = _controller(env, rng)
@@ -131,7 +131,7 @@ def _roll_out(job: tuple[str, int, int, int, int]) -> EpisodeArrays:
 
 
 def _explore(action: np.ndarray, style: Style, rng: np.random.Generator) -> np.ndarray:
-    """The action (2,) float32 that is executed in place of a controller's."""
+    """The executed (2,) float32 action: a controller's action with noise."""
     if style.noise:
         action = action + rng.normal(0, style.noise, 2)
     if style.zero_share + style.random_share > 0:
@@ -144,7 +144,7 @@ def _explore(action: np.ndarray, style: Style, rng: np.random.Generator) -> np.n
 
 
 def _controller(env: MazeEnv, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """What drives: the action for a state and a goal."""
+    """The maze's controller, a function of state and goal."""
     from vd4rl_pomdp.studies.navigation.drivers import FirstPersonController, Planner, WaypointPlanner
 
     if env.maze_spec.first_person:
@@ -154,14 +154,14 @@ def _controller(env: MazeEnv, rng: np.random.Generator) -> Callable[[np.ndarray,
 
 @cache
 def _environment(maze: str, action_repeat: int) -> MazeEnv:
-    """The process's environment for these arguments: one GL context serves all its trajectories."""
+    """This process's environment, cached so that all trajectories share one GL context."""
     from vd4rl_pomdp.envs.maze import MazeEnv
 
     return MazeEnv(maze, action_repeat)
 
 
 def sample_observations() -> dict[str, np.ndarray]:
-    """Pictures along a drive through every maze, then of one in grey and with exogenous noise.
+    """Images along a trajectory in every maze, then in grey and with exogenous noise for one maze.
 
     Returns:
         (SAMPLES, 3, H, W) uint8 by name.

@@ -68,7 +68,7 @@ class ReferenceOptions(Options):
     """Options of the references, which train no inverse model."""
 
     max_k: int = 15
-    """The K of the objectives that it is compared with: its cell of a table, and one of the initial draws."""
+    """The K of the objectives to compare with; it determines a table cell and one of the initial draws."""
 
     limits: ClassVar[Limits] = {"max_k": 1}
 
@@ -78,7 +78,7 @@ class NoiseOptions(Options):
     """Options of exogenous noise."""
 
     exogenous_weight: float = 0.5
-    """What the added images are multiplied by."""
+    """Factor of the added images."""
 
     limits: ClassVar[Limits] = {"exogenous_weight": (0, 1)}
 
@@ -99,30 +99,29 @@ class NavigationConfig(TrainingConfig):
     """
 
     average_last: int = 10_000
-    """Last steps over which the reported training metrics are averaged."""
+    """Number of last steps over which reported training metrics are averaged."""
     schedule: Literal["constant", "cosine"] = "constant"
-    """Learning rate after the warm-up: constant, or a half cosine down to zero."""
+    """Learning rate after the warm-up: constant, or cosine decay to zero."""
     warm_up: int = 0
-    """Steps in which the learning rate rises linearly."""
+    """Steps of linear learning-rate warm-up."""
     picture: Picture = "rgb100"
-    """rgb100: pictures as stored; rgb50: averaged over 2x2 pixels; grey50: the luminance of these."""
+    """rgb100: images as stored; rgb50: averaged over 2x2 pixels; grey50: their luminance."""
     exogenous: str = "none"
-    """Images added to every picture: none, textures, photographs, or a folder of CIFAR-10's or of PNG
-    and JPEG files."""
+    """Images added to every observation: none, textures, photographs, or a folder of CIFAR-10, PNG or JPEG files."""
     noise: Options = NO_OPTIONS
-    """How the images are added."""
+    """Options of the exogenous noise."""
     burn_in: int = 10
-    """First rows of a window on which no state error is counted."""
+    """First rows of a window, excluded from state errors."""
     evaluation_windows: int = 256
-    """Held-out windows to evaluate on."""
+    """Held-out evaluation windows."""
     refit_windows: int = 1024
-    """Training windows whose frozen states the probe is refitted on."""
+    """Training windows to refit the probe on."""
     refit_steps: int = 4_000
-    """Gradient steps of that probe."""
+    """Gradient steps of the refitted probe."""
 
     choosers: ClassVar[tuple[str, ...]] = (*TrainingConfig.choosers, "exogenous")
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": _PAPER, "cpu": _CPU, "smoke": _CPU | _SMOKE}
-    """The paper's setting for a GPU, one for two cores, and one that takes seconds."""
+    """The paper's setting for a GPU, one for two CPU cores, and one that takes seconds."""
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
@@ -136,14 +135,14 @@ class NavigationConfig(TrainingConfig):
         }
 
     def trained(self) -> TrainingConfig:
-        """The same settings for the objective whose network a method has: its own, unless it is a reference."""
+        """The same settings for the objective that a method trains: itself, unless it is a reference."""
         if self.method not in REFERENCES:
             return self
         method, values = _NETWORK_OF[self.method], self.defaults(self.preset) | flat(self)
         return replace(self, method=method, options=METHODS.named(method).options.fill(values))
 
     def check(self) -> None:
-        """Refuse settings that cannot work, before anything is read or written."""
+        """Reject invalid settings before anything is read or written."""
         super().check()
         refuse_outside(
             self, steps=1, burn_in=0, average_last=1, evaluation_windows=1, refit_windows=1, refit_steps=1, warm_up=0
@@ -157,7 +156,7 @@ class NavigationConfig(TrainingConfig):
 
 
 def command_of(config: NavigationConfig) -> list[str]:
-    """Words of the command that trains with a config: the preset, and every flag that differs from it."""
+    """The command that trains with a config: the preset, and every flag that differs from it."""
     usual = config.usual() | config.defaults(config.preset)
     untold = ("preset", "device", "wandb", "tensorboard")
     changed = {name: value for name, value in flat(config).items() if name not in untold and value != usual.get(name)}

@@ -1,6 +1,6 @@
-"""A maze's set as a model sees it: windows of pictures with the true states of their rows.
+"""A maze's dataset for training: windows of images with the true states of their rows.
 
-Exogenous noise may be added to the pictures; the small presets see a quarter of their pixels, in grey.
+Exogenous noise may be added to the images; the small presets use a quarter of the pixels, in grey.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, sour
 
 _BLOCK = 1000
 HELD_OUT = 10
-"""One in this many trajectories, the last ones, is never trained on."""
+"""One in this many trajectories, the last ones, is held out."""
 
 
 class MazeView(View):
-    """A maze's set as a model sees it: one picture a row, with the exogenous noise of its key."""
+    """Observations of a maze's dataset: one image per row, with the exogenous noise of its key."""
 
     def __init__(self, dataset: Dataset, noise: ExogenousNoise | None) -> None:
         super().__init__(dataset, frame_stack=1)
@@ -39,14 +39,10 @@ class MazeView(View):
 
 
 class MazeData:
-    """Batches of a maze's set: the first trajectories are for training, the last tenth is held out."""
+    """Batches of a maze's dataset: the last tenth of the trajectories is held out, the others are for training."""
 
     def __init__(self, config: NavigationConfig, cache: Path | None = None) -> None:
-        """Open the set that a config names, with its exogenous noise, on the CPU.
-
-        Raises:
-            UserError: it is of something else, holds no true states, or is too small.
-        """
+        """Open the config's dataset, with its exogenous noise, on the CPU; UserError if it does not fit."""
         dataset, path = open_dataset(config.data, cache), config.data
         names = {stored.get("task") for stored in dataset.store.meta["attributes"]}
         for wrong, what in (
@@ -70,7 +66,7 @@ class MazeData:
         raw = torch.from_numpy(dataset.physics[:, self.maze.position + self.maze.velocity])
         std, mean = torch.std_mean(raw[:split], dim=0)
         self.states, self.mean, self.std = ((raw - mean) / std).float(), mean.float(), std.float()
-        """(N, 4) float32 states of all rows, standardised by (4,) moments of the training rows."""
+        """(N, 4) float32 states of all rows, standardised by mean and std (4,) of the training rows."""
         self.hidden = torch.from_numpy(self.maze.hidden(dataset.physics))
         """(N,) bool: a curtain covers the whole mass."""
         rows = dataset.transition_rows
@@ -78,9 +74,9 @@ class MazeData:
         """(M, 2) float32."""
         self.total = dataset.num_windows(config.window)
         self.training = int(dataset.windows_per_episode(config.window)[: self.first_held_out].sum())
-        """Windows 0..training-1 are for training, the rest is held out."""
+        """Windows 0..training-1 are for training, the others are held out."""
         self.inputs = {"data": dataset.fingerprint}
-        """What a run on it reads, by name and content."""
+        """Fingerprints of a run's inputs by name."""
         noise = None
         if isinstance(config.noise, NoiseOptions):
             noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
@@ -89,7 +85,7 @@ class MazeData:
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""
-        if self._config.picture != "rgb100":  # drawn once for all: training then never touches the large pictures
+        if self._config.picture != "rgb100":  # shrunk once, so that training never touches the large images
             channels, size = SHAPES[self._config.picture]
             shrink = to_grey50 if channels == 1 else to_rgb50
             small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
@@ -102,11 +98,11 @@ class MazeData:
         return self
 
     def windows(self, number: Tensor, length: int | None = None) -> Windows:
-        """Windows by (B,) numbers, as the model sees them."""
+        """Windows by (B,) numbers, as observed by the model."""
         return self.view.windows(number, length or self._config.window)
 
     def spread(self, count: int, held_out: bool) -> list[Tensor]:
-        """Numbers of `count` windows, evenly spread over the training or the held-out ones, in batches."""
+        """Numbers of `count` windows, evenly spaced over the training or held-out ones, in batches."""
         first, last = (self.training, self.total) if held_out else (0, self.training)
         numbers = torch.linspace(first, last - 1, min(count, last - first)).long()
         return list(numbers.split(self._config.batch_size))

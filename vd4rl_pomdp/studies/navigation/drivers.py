@@ -1,8 +1,8 @@
-"""What drives through the mazes: planners where the camera looks from the top, a small actor in first person.
+"""Controllers for the mazes: planners for the top view, a small trained actor for the first-person view.
 
 The actor is trained by PPO (stable-baselines3) on states, exported as a small file and shipped. Its inputs are the next
-waypoint and its velocity, both relative to its heading. The reward is the distance by which it comes nearer to the
-goal, and 1 for reaching it. PPO's Gaussian is applied before a tanh, as in an actor's file (see `policies.actor`).
+waypoint and its velocity, both in its own frame. The reward is the progress towards the goal, plus 1 for reaching it.
+PPO's Gaussian is applied before a tanh, as in an actor's file (see `policies.actor`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 POSITION_GAIN, VELOCITY_GAIN = 3.0, 0.6
-"""A planner's action for each unit of distance to the waypoint, and against each unit/s of velocity."""
+"""Gains of the planner: on distance to the waypoint, and against velocity."""
 _ASSETS = Path(__file__).parent / "assets"
 FEATURES = 4
 _EPISODE = 200
@@ -34,7 +34,7 @@ _PARALLEL = 8
 
 
 class Planner:
-    """Drives the mass to the environment's goal, straight through the cells; noise is the caller's."""
+    """Drives the mass to the environment's goal, straight through the cells; the caller adds noise."""
 
     def __init__(self, env: MazeEnv) -> None:
         self._maze = env.maze
@@ -55,13 +55,13 @@ class Planner:
         return POSITION_GAIN * (self.waypoint(state[:2], goal) - state[:2]) - VELOCITY_GAIN * state[2:]
 
     def waypoint(self, position: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """The point to head for from a (2,) position: the goal if it is at most one cell away, else the next cell."""
+        """Where to head from a (2,) position: the goal if it is at most one cell away, else the next cell."""
         there = self._cell(goal)
         following = self._next[there][self._cell(position)]
         return goal if following == there else self._maze.cell_rowcol_to_xy(np.array(following))
 
     def distance(self, position: np.ndarray, goal: np.ndarray) -> float:
-        """Length of the path over the waypoints from a (2,) position to a goal."""
+        """Path length over the waypoints from a (2,) position to a goal."""
         length, here = 0.0, position
         while True:
             target = self.waypoint(here, goal)
@@ -84,15 +84,15 @@ class Planner:
 
 
 class WaypointPlanner:
-    """The planner of the published generator: it halts at a waypoint beside every cell's centre, and then at the goal.
+    """The planner of the published generator: it stops at a waypoint near every cell's centre, and then at the goal.
 
-    A waypoint is passed at walking pace: within NEAR of it by a mass that moved less than NEAR in the last decision.
+    A waypoint counts as passed within NEAR of it, if the mass moved less than NEAR in the last decision.
     """
 
     NEAR = 0.1
     POSITION_GAIN, VELOCITY_GAIN = 5.0, 1.0
     JITTER = 0.2
-    """Waypoints but the last lie up to this much, uniformly, from their cells' points back towards the centres."""
+    """Waypoints except the last are jittered uniformly by up to this much towards the cells' centres."""
 
     def __init__(self, env: MazeEnv, rng: np.random.Generator) -> None:
         self._planner, self._rng = Planner(env), rng
@@ -120,24 +120,24 @@ class FirstPersonConfig:
     """Settings of `vd4rl-pomdp navigation policy`."""
 
     out: Path
-    """File of the actor."""
+    """File to write the actor to."""
     maze: str = "first_person"
     """first_person, or hard_first_person."""
     decisions: int = 200_000
-    """Environment decisions, at the least: PPO makes whole rounds of 2,048."""
+    """Minimum environment decisions; PPO makes whole rounds of 2,048."""
     action_repeat: int = ACTION_REPEAT
-    """Simulator steps of 0.01 s for one action."""
+    """Simulator steps of 0.01 s per action."""
     seed: int = 0
     """Seed of the networks and the episodes."""
 
 
 def shipped_actor(maze: MazeSpec) -> Actor:
-    """What drives through a first-person maze: one actor for each kind of kinematics."""
+    """The actor for a first-person maze: one per kind of kinematics."""
     return read_actor(_ASSETS / f"{'hard_' if maze.style is HARD else ''}first_person.safetensors")
 
 
 def features(state: np.ndarray, waypoint: np.ndarray) -> np.ndarray:
-    """The actor's inputs for a (6,) state: (4,) float32, waypoint and velocity in the frame of its heading."""
+    """The actor's inputs for a (6,) state: (4,) float32, waypoint and velocity in its own frame."""
     ahead = np.array([np.cos(state[2]), np.sin(state[2])])
     left = np.array([-ahead[1], ahead[0]])
     way = waypoint - state[:2]
@@ -145,7 +145,7 @@ def features(state: np.ndarray, waypoint: np.ndarray) -> np.ndarray:
 
 
 class FirstPersonController:
-    """Drives to the environment's goal by the mean action of an actor, the shipped one by default."""
+    """Drives to the environment's goal with an actor's mean action; by default the shipped one."""
 
     def __init__(self, env: MazeEnv, actor: Actor | None = None) -> None:
         self._planner = Planner(env)
@@ -157,7 +157,7 @@ class FirstPersonController:
 
 
 class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """The first-person maze as a task on states, for PPO."""
+    """The first-person maze on states, for PPO."""
 
     def __init__(self, maze: str, action_repeat: int) -> None:
         self._env = MazeEnv(maze, action_repeat, pixels=False)
@@ -169,14 +169,14 @@ class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Another start and goal."""
+        """Start from a new position with a new goal."""
         super().reset(seed=seed)
         self._env.reset(seed=seed)
         self._steps = 0
         return self._features(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply tanh(action); the reward is the distance covered towards the goal, and 1 for reaching it."""
+        """Apply tanh(action); the reward is the progress towards the goal, plus 1 for reaching it."""
         goal = self._env.goal
         before = self._planner.distance(self._env.state[:2], goal)
         _, reached, *_ = self._env.step(np.tanh(action))
@@ -189,7 +189,7 @@ class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def train_first_person(config: FirstPersonConfig) -> Actor:
-    """Train and write the actor; its card holds the number of goals that it reaches in 20 episodes."""
+    """Train and write the actor; its card holds the number of goals reached in 20 episodes."""
     if not get_maze(config.maze).first_person:
         raise UserError(f"--maze is {config.maze}, which a planner drives through; choose first_person")
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
@@ -209,7 +209,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
         ) from None
 
     class Report(BaseCallback):
-        """Moves the progress line."""
+        """Updates the progress line."""
 
         def _on_step(self) -> bool:
             progress.advance(_PARALLEL)
@@ -227,7 +227,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
         device="cpu",
         policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.ReLU},
     )
-    model.set_logger(Logger(None, []))  # its own would leave an empty folder among the temporary files
+    model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
         model.learn(config.decisions, callback=Report())
     policy: Any = model.policy
@@ -252,7 +252,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
 
 
 def goals_reached(actor: Actor, maze: str, action_repeat: int, episodes: int) -> int:
-    """Goals that the mean action reaches in episodes of 200 decisions from fixed seeds."""
+    """Goals reached by the mean action in episodes of 200 decisions with fixed seeds."""
     env = MazeEnv(maze, action_repeat, pixels=False)
     controller, reached = FirstPersonController(env, actor), 0
     for episode in range(episodes):

@@ -1,4 +1,4 @@
-"""Pictures of the navigation study: accuracy bars, trajectories over the maze, what a model is shown, and a film."""
+"""Figures of the navigation study: accuracy bars, trajectories over the maze, sample observations, and a video."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ _VARIANTS = {
 }
 """Bars of an objective: K, self-prediction, colour."""
 _DRIVEN, _DRIVEN_ROWS = ("mik+a", "ah+a", "no_history"), 100
-"""Methods whose trajectories are drawn, and how many rows of them."""
+"""Methods whose trajectories are drawn, and the number of rows."""
 _OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
 _SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
 _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
 _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
 SIDE, HEAD = 240, 22
-"""Of a film, pixels of a panel's maze, and of the line above it."""
+"""Sizes of a video panel in pixels: the maze's side, and the height of the line above it."""
 _FINE = 2
 _SHOWN = 1.75
-"""How far from the centre is shown: the free cells, and some of the walls around them."""
+"""Half width of the visible part of the maze: the free cells and some of the walls."""
 _MILLISECONDS = 80
-"""Of a frame: a little slower than the mass is."""
+"""Milliseconds per video frame: slightly slower than real time."""
 _WALL, _FLOOR, _PAPER, _INK = (228, 201, 168), (58, 82, 110), (255, 255, 255), (30, 30, 30)
 _CURTAIN, _TRUE, _RING = (200, 140, 85, 165), (90, 200, 90), (255, 90, 0)
 
 
 def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
-    """State prediction accuracy, 100 - error, of every objective and maze, as in the paper's bar plot.
+    """Bar plot of state prediction accuracy, 100 - error, by objective and maze, as in the paper.
 
-    A panel for each maze whose runs have the measure; False, and no file, if none has. The paper's marks stand beside
-    raw units alone. What a maze lacks and the paper, another maze or the references have is crossed.
+    One panel per maze with runs of the measure; False, without a file, if there are none. The paper's numbers are shown
+    only for raw units. Crosses mark missing runs that the paper, another maze or the references have.
     """
     shown = frame[(frame[list(Measure._fields)] == list(measure)).all(axis=1)]
     mazes = [maze for maze in MAZES if maze in set(shown["maze"])]
@@ -130,7 +130,7 @@ def trajectories(runs: list[NavigationRun], path: Path) -> bool:
 
 
 def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
-    """A row of pictures for each name: (n, 3, H, W) uint8, as many for all."""
+    """One row of images per name: (n, 3, H, W) uint8, with equal n."""
     columns = max(map(len, samples.values()))
     figure = Figure(figsize=(1.5 * columns + 1.6, 1.55 * len(samples)), layout="constrained")
     panels = figure.subplots(len(samples), columns)
@@ -144,14 +144,14 @@ def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
 
 
 def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> None:
-    """Write an animated GIF with one panel for each name.
+    """Write an animated GIF with one panel per name.
 
-    The true mass is a green disc, under curtains as one sees through them here; the estimate is an orange ring.
+    The true mass is a green disc, visible through the curtains here; the estimate is an orange ring.
 
     Args:
-        trajectories: `trajectory.csv` of runs on that maze, by what to write above them.
-        maze: whose walls and curtains are drawn.
-        path: the file.
+        trajectories: `trajectory.csv` of runs on that maze, by panel title.
+        maze: maze to draw.
+        path: output file.
     """
     tables = {name: read_trajectory(file) for name, file in trajectories.items()}
     ground = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)
@@ -181,7 +181,7 @@ def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> 
 
 
 def to_pixels(x: float, y: float) -> tuple[float, float]:
-    """Column and row within a panel of a position in the maze."""
+    """Column and row in a panel of a position in the maze."""
     return (x + _SHOWN) / (2 * _SHOWN) * SIDE, HEAD + (_SHOWN - y) / (2 * _SHOWN) * SIDE
 
 

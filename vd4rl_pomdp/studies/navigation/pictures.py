@@ -1,10 +1,8 @@
-"""What a model is shown of a maze: its picture, or a grey quarter of it, with exogenous noise if that is asked for.
+"""What a model observes of a maze: the image, or a smaller or grey version of it, with optional exogenous noise.
 
-Exogenous noise is an image from a pool that is added to each observation, and has nothing to do with the agent.
-
-A row's key chooses its image, so that a row always shows the same one, as in a real environment. The pool consists of
-generated textures, of crops of the two photographs that scikit-learn ships, or of a folder's images: CIFAR-10's python
-or binary files, PNG, JPEG.
+Exogenous noise adds an image from a pool, unrelated to the agent, to each observation. A row's key selects the image,
+so a row always shows the same one, as in a real environment. The pool consists of generated textures, of crops of the
+two photographs in scikit-learn, or of a folder's images: CIFAR-10's python or binary files, PNG, JPEG.
 """
 
 from __future__ import annotations
@@ -30,22 +28,22 @@ from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 Picture = Literal["rgb100", "rgb50", "grey50"]
 _HALF = PICTURE_SIZE // 2
 SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "rgb50": (3, _HALF), "grey50": (1, _HALF)}
-"""Channels and size of an observation."""
+"""Channels and size of each observation format."""
 _LUMA = (0.299, 0.587, 0.114)
 TEXTURES, PHOTOGRAPHS = "textures", "photographs"
-"""Names of the pools that need no files."""
+"""Built-in pools."""
 POOL = 1024
-"""Images in a pool at most."""
+"""Maximum images in a pool."""
 _CIFAR_SIDE, _CIFAR_CLASSES = 32, 10
 _CIFAR_BYTES = 3 * _CIFAR_SIDE**2
 _CROPS = (120, 400)
-"""Least and greatest side of a photograph's crop, in its pixels."""
+"""Minimum and maximum side of a photograph's crop in pixels."""
 _DISCS, _RADII, _CONTRAST = 300, (4.0, 60.0), 60.0
-"""Discs of a texture, their least and greatest radius in pixels, and the standard deviation of their colours."""
+"""Of a texture: number of discs, their radius range in pixels, and the standard deviation of their colours."""
 
 
 class ExogenousNoise:
-    """Adds `weight` times an image of the pool to each picture and clips."""
+    """Adds `weight` times an image of the pool to each observation and clips."""
 
     def __init__(self, source: str, weight: float, seed: int) -> None:
         self._weight = weight
@@ -54,7 +52,7 @@ class ExogenousNoise:
         """(P, 3, 100, 100) uint8."""
 
     def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
-        """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
+        """Noisy copies of (N, 3, 100, 100) uint8 images, drawn by (N,) int64 row keys."""
         self.pool = self.pool.to(pictures.device)
         chosen = draw_integers(derive_keys(self._seed, key), len(self.pool), 1)[:, 0]
         added = self.pool[chosen].float().mul_(self._weight)
@@ -62,7 +60,7 @@ class ExogenousNoise:
 
 
 def source_fingerprint(source: str) -> str:
-    """Hash of the files of a pool; for one that needs none, only its name."""
+    """Hash of a pool's files; for a built-in pool, its name."""
     if source in _MADE:
         return source
     digest = hashlib.blake2b(digest_size=12)
@@ -72,12 +70,10 @@ def source_fingerprint(source: str) -> str:
 
 
 def load_pool(source: str, seed: int) -> Tensor:
-    """Images to add: (P, 3, 100, 100) uint8, at most POOL.
-
-    Of PNG and JPEG files only those of the pool are decoded, however many there are.
+    """Images to add: (P, 3, 100, 100) uint8, at most POOL; of PNG and JPEG files only the drawn ones are decoded.
 
     Raises:
-        UserError: it is neither the name of a pool nor a folder with files of images.
+        UserError: the source is neither a built-in pool nor a folder of image files.
     """
     rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
     if source in _MADE:
@@ -97,14 +93,15 @@ def load_pool(source: str, seed: int) -> Tensor:
     for file in np.unique(number):
         mine = np.flatnonzero(number == file)
         images = batches[files[file]] if files[file] in batches else _read_image(files[file])
-        pool[mine] = _to_size(images[drawn[mine] - ends[file]])  # counted from the file's end
+        pool[mine] = _to_size(images[drawn[mine] - ends[file]])  # a negative index, counted from the file's end
     return pool
 
 
 def _textures(rng: np.random.Generator) -> Tensor:
-    """Pictures of discs that cover each other, radii with density r^-3, colours around the image's own.
+    """Dead leaves: overlapping discs with radius density r^-3 and colours around the image's mean.
 
-    Edges and scales are those of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural images").
+    They have edge and scale statistics of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural
+    images").
     """
     return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
 
@@ -123,7 +120,7 @@ def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
 
 
 def _photographs(rng: np.random.Generator) -> Tensor:
-    """Random square crops, mirrored half of the time."""
+    """Random square crops, half of them mirrored."""
     from sklearn.datasets import load_sample_images
 
     photographs = load_sample_images().images
@@ -138,14 +135,14 @@ def _photographs(rng: np.random.Generator) -> Tensor:
 
 
 _MADE = {TEXTURES: _textures, PHOTOGRAPHS: _photographs}
-"""Pools that need no files: what makes them, by name."""
+"""Built-in pools by name."""
 
 
 def _files(folder: Path) -> list[Path]:
-    """Files of a folder that hold images, in order."""
+    """Sorted image files of a folder."""
     with disk_errors(folder):
         files = sorted(path for path in folder.rglob("*") if path.is_file())
-    shown = (path for path in files if not path.name.startswith("."))  # macOS leaves ._x.png beside x.png
+    shown = (path for path in files if not path.name.startswith("."))  # macOS writes ._x.png beside x.png
     return [path for path in shown if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
 
 
@@ -159,15 +156,15 @@ def _read_image(path: Path) -> np.ndarray:
         return np.asarray(Image.open(io.BytesIO(read_bytes(path))).convert("RGB"))[None]
     except UserError:
         raise
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # raised by Pillow
         raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
 
 
 def _read_cifar(path: Path) -> np.ndarray:
-    """(N, 32, 32, 3) uint8 of one CIFAR-10 file, POOL of them at most.
+    """(N, 32, 32, 3) uint8 of one CIFAR-10 file, at most POOL of them.
 
-    A binary file has a label before every image. In a pickled batch the pixels are the one long run of bytes, which is
-    found without running the pickle.
+    A binary file has a label before every image. In a pickled batch, the pixels are the only long byte string, which is
+    found without unpickling.
     """
     content, labels = read_bytes(path), int(path.suffix == ".bin")
     try:
@@ -190,13 +187,13 @@ def _to_size(images: np.ndarray) -> Tensor:
 
 
 def to_grey50(pictures: Tensor) -> Tensor:
-    """Area averages of the luminance: (N, 3, 100, 100) uint8 -> (N, 1, 50, 50) uint8."""
+    """Luminance averaged over 2x2 pixels: (N, 3, 100, 100) uint8 -> (N, 1, 50, 50) uint8."""
     weights = torch.tensor(_LUMA, device=pictures.device) / 4
     return torch.einsum("nchw,c->nhw", _sums(pictures).float(), weights).round_().to(torch.uint8)[:, None]
 
 
 def to_rgb50(pictures: Tensor) -> Tensor:
-    """Area averages: (N, 3, 100, 100) uint8 -> (N, 3, 50, 50) uint8."""
+    """Average over 2x2 pixels: (N, 3, 100, 100) uint8 -> (N, 3, 50, 50) uint8."""
     return ((_sums(pictures) + 2) // 4).to(torch.uint8)
 
 

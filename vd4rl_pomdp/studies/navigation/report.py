@@ -1,10 +1,10 @@
-"""The navigation report: the paper's tables from raw rows, each number beside the paper's, and what they say.
+"""The navigation report: the paper's tables from raw rows, next to the paper's numbers, and verdicts on its claims.
 
-OUT/report.md     tables, verdicts, figures, and the command of every condition
-OUT/runs.jsonl, episodes.csv, trajectories/     a results folder; `navigation report OUT` makes everything again from it
+OUT/report.md     tables, verdicts, figures, and the command of every run
+OUT/runs.jsonl, episodes.csv, trajectories/     a results folder; `navigation report OUT` rebuilds everything from it
 OUT/rows.csv      every number of every run
-OUT/tables.csv    every number: mean, interval, seeds, the paper's number
-OUT/figures/      accuracy.png, accuracy_raw.png (beside the paper's numbers), trajectories.png, observations.png
+OUT/tables.csv    every cell: mean, interval, seeds, the paper's number
+OUT/figures/      accuracy.png, accuracy_raw.png (next to the paper's numbers), trajectories.png, observations.png
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _PROTOCOLS = {
     f"{_ONLINE}, probe trained beside the model (the paper's way)": ("training", "online"),
     f"{_REFITTED}, probe refitted on frozen states": ("held_out", "refit"),
 }
-"""How an error is measured: the split and the probe."""
+"""Error protocols: split and probe."""
 _LOSS_PROTOCOLS = {f"{_ONLINE} (the paper's way)": ("training", ""), _REFITTED: ("held_out", "")}
 _UNITS = {False: "% of a standard deviation", True: "raw units x 100, beside the paper"}
 _TITLES = {
@@ -81,7 +81,7 @@ LITERAL = Condition("", "mik+a", 1, literal_future=True)
 
 
 def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
-    """The paper's six tables (position and velocity are one of them), then four of our own: one line a number.
+    """Cells of the paper's six tables (position and velocity are one of them) and of four of our own.
 
     Returns:
         `table`, `view` and `row` where the number stands, KEYS, `mean`, `low` and `high` (95% t interval), `seeds` and
@@ -105,7 +105,7 @@ def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _layout(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, Condition, Measure]]:
-    """What stands where in every table, table by table and row by row: table, view, row, and whose number it is."""
+    """All cells, table by table and row by row: table, view, row, condition and measure."""
     told, refitted = {condition_of(line, "") for line in paper_rows()}, tuple(_PROTOCOLS)[1]
     references = {method: Condition("", method) for method in REFERENCES}
     found = frame[list(Condition._fields)].assign(maze="").drop_duplicates().itertuples(index=False, name=None)
@@ -138,7 +138,7 @@ def _layout(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, Condition, Mea
         losses = table in ("action_loss", "by_k")
         for raw in (False,) if losses else (False, True):
             trained = set(frame["maze"][frame["measure"].str.startswith(RAW_PREFIX if raw else "")])
-            paper = trained & set(PAPER_MAZES)  # columns: all of the paper's mazes or none, and variants that have runs
+            paper = trained & set(PAPER_MAZES)  # all of the paper's mazes if any of them has runs
             mazes = [maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES)]
             if table == "exogenous_main":
                 mazes = [maze for maze in mazes if MAZES[maze].paper in MAIN_TEXT]
@@ -151,7 +151,7 @@ def _layout(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, Condition, Mea
 
 
 def cell_text(cell: pd.Series) -> str:
-    """Mean, interval, seeds, and the paper's number in brackets; "no run" for one that is missing."""
+    """Text of a cell: mean, interval, seeds and (the paper's number); "no run" if it is missing."""
     paper = "" if pd.isna(cell["paper"]) else f"({cell['paper']:.1f})"
     if not cell["seeds"]:
         return f"no run {paper}".rstrip() if cell["missing"] else paper
@@ -161,7 +161,7 @@ def cell_text(cell: pd.Series) -> str:
 
 
 def table_sections(cells: pd.DataFrame) -> Iterator[str]:
-    """Lines of a page's part: every table under its title, a column for each maze."""
+    """Markdown lines of all tables under their titles, one column per maze."""
     texts = cells.assign(text=cells.apply(cell_text, axis=1))
     for name, title in _TITLES.items():
         mine = texts[texts["table"] == name]
@@ -177,7 +177,7 @@ def table_sections(cells: pd.DataFrame) -> Iterator[str]:
 
 
 def write_tables(cells: pd.DataFrame, path: Path) -> None:
-    """Write every number of the tables as CSV."""
+    """Write the cells of all tables as CSV."""
     shown = cells[(cells["seeds"] > 0) | cells["missing"]].copy()
     for name in ("mean", "low", "high"):
         shown[name] = ["" if pd.isna(value) else f"{value:.4g}" for value in shown[name]]
@@ -187,17 +187,17 @@ def write_tables(cells: pd.DataFrame, path: Path) -> None:
 
 
 NEAR_ZERO = 5.0
-"""Action loss (nats x 100) that counts as near zero; guessing among 20 codes is 300."""
+"""Action loss (nats x 100) that counts as near zero; random guessing among 20 codes gives 300."""
 FEW = 15.0
-"""State error (% of a standard deviation) below which a first person is said to know where it is."""
+"""State error (% of a standard deviation) below which a first-person agent counts as localised."""
 _RELATIONS = {">=": operator.ge, "<=": operator.le, "<": operator.lt, ">": operator.gt}
 ClaimSide = tuple[Condition, Measure]
 Numbers = Mapping[tuple[Any, ...], Mapping[int, float]]
-"""What `numbers_of` returns."""
+"""Output of `numbers_of`."""
 
 
 class Claim(NamedTuple):
-    """`left` compared with `factor` times `right`; without a right side, with `factor` itself."""
+    """Compares `left` with `factor` times `right`, or with `factor` itself if there is no right side."""
 
     text: str
     left: ClaimSide
@@ -206,14 +206,14 @@ class Claim(NamedTuple):
     right: ClaimSide | None = None
 
     def raw(self) -> Claim:
-        """The same statement about errors in the simulator's units; itself where it names a bound in its own."""
+        """The claim for raw errors in the simulator's units; unchanged if it has an absolute bound."""
         if self.right is None:
             return self
         left, right = ((condition, measure.raw()) for condition, measure in (self.left, self.right))
         return self._replace(left=left, right=right)
 
     def holds(self, left: float, right: float) -> bool:
-        """Whether two numbers are in the relation."""
+        """Whether two numbers satisfy the relation."""
         return bool(_RELATIONS[self.relation](left, self.factor * right))
 
     def words(self, left: float, right: float) -> str:
@@ -222,20 +222,20 @@ class Claim(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """A claim and what the runs say."""
+    """A claim with the runs' numbers."""
 
     claim: Claim
     left: float
     right: float
-    """Means over the seeds for which both numbers exist; NaN while there is none."""
+    """Means over seeds that have both numbers; NaN if there are none."""
     seeds: int
     seeds_holding: int
     paper: tuple[float, float] | None
-    """The paper's own two numbers, where it has them and the claim is in its units."""
+    """The paper's two numbers, if it has both and the claim is in its units."""
 
     @property
     def holds(self) -> bool:
-        """Whether it holds for the means over seeds."""
+        """Whether the claim holds for the means."""
         return self.seeds > 0 and self.claim.holds(self.left, self.right)
 
     @property
@@ -245,10 +245,10 @@ class Verdict(NamedTuple):
 
 
 def claims(maze: str) -> list[Claim]:
-    """The claims about one maze: first whether training has gone far enough to compare, then the paper's statements.
+    """Claims about one maze: first whether training is long enough for comparisons, then the paper's statements.
 
-    Their wording and their bounds (half, three times) are this package's; some hold encoders against an untrained one,
-    which the paper's tables do not have.
+    Wording and bounds (half, three times) are this package's; some compare with an untrained encoder, which the paper
+    does not have.
     """
 
     def of(method: str, measure: Measure | str, max_k: int = 15, **options: bool) -> ClaimSide:
@@ -271,7 +271,7 @@ def claims(maze: str) -> list[Claim]:
             Claim("mik's velocity error, of mik+a's", of("mik", "velocity"), ">=", 1.5, slow),
             Claim("ah's state error, of mik+a's", of("ah", "state"), ">", 1, of("mik+a", "state")),
         ]
-    if MAZES[maze].paper == "first_person":  # the place is known where a picture does not tell it, by far
+    if MAZES[maze].paper == "first_person":  # the position is known by far where one image does not reveal it
         for told, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
             ours = of("mik+a", "state", self_prediction=told)
             found += [
@@ -289,7 +289,7 @@ def claims(maze: str) -> list[Claim]:
 
 
 def judge(claim: Claim, numbers: Numbers) -> Verdict:
-    """What the runs say of a claim, over the seeds that both sides have."""
+    """Evaluate a claim over the seeds that both sides have."""
     left = numbers.get((*claim.left[0], *claim.left[1]), {})
     right = numbers.get((*claim.right[0], *claim.right[1]), {}) if claim.right else dict.fromkeys(left, 1.0)
     seeds = sorted(left.keys() & right.keys())
@@ -300,7 +300,7 @@ def judge(claim: Claim, numbers: Numbers) -> Verdict:
 
 
 def verdict_lines(frame: pd.DataFrame) -> list[str]:
-    """A section of a page: all statements about the mazes of some runs, whether they hold, and the paper's numbers."""
+    """A report section: the claims about all mazes with runs, whether they hold, and the paper's numbers."""
     numbers, mazes = numbers_of(frame), set(frame["maze"])
     pairs = [
         (maze, judge(claim, numbers), judge(claim.raw(), numbers))
@@ -347,7 +347,7 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
 
 
 Samples = Callable[[], Mapping[str, np.ndarray]]
-"""Draws sample observations: (n, 3, H, W) uint8 by name."""
+"""Renders sample observations: (n, 3, H, W) uint8 by name."""
 _CAPTIONS = (
     ("accuracy.png", "Accuracy of every objective", "Bars: held-out trajectories, probe refitted on frozen states."),
     ("accuracy_raw.png", "The same in raw units", "The paper's marks are training averages."),
@@ -383,13 +383,13 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
 
     Args:
         sources: run folders, results folders, or folders that contain some.
-        out: where to.
-        samples: draws the sample observations, which needs OpenGL; None leaves them out.
+        out: output folder.
+        samples: renders sample observations, which needs OpenGL; None leaves them out.
     """
     refuse_foreign(out, "navigation report", RUNS)
     found = find_navigation(sources, out)
     runs, unfinished = load_runs(found), [result for result in found if not result.finished]
-    drawn = samples() if samples is not None else None  # before anything is written: there may be no OpenGL
+    drawn = samples() if samples is not None else None  # before anything is written, since OpenGL may be missing
     with owned(out):
         save_runs(runs, out)
         frame, figured = frame_of(runs), out / "figures"
@@ -420,7 +420,7 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
 
 
 def _head(runs: list[NavigationRun], unfinished: list[Result]) -> list[str]:
-    """What the runs are, what they cost, what they differ in, and how the tables read."""
+    """Head of the page: runs, cost, differing settings, and how to read the tables."""
     seeds = sorted({run.seed for run in runs})
     timings = [run.result.files["timing"] for run in runs if run.condition.method != UNTRAINED]
     timings = timings or [run.result.files["timing"] for run in runs]
@@ -443,12 +443,12 @@ def _head(runs: list[NavigationRun], unfinished: list[Result]) -> list[str]:
         "The paper's: 200,000 steps on 500,000 samples.",
         "",
     ]
-    unlike = []  # what runs on one maze differ in beside what tells them apart: a sentence a setting
+    unlike = []  # one sentence per setting that differs among runs on one maze and is not part of their condition
     for maze, members in groupby(runs, key=lambda run: run.condition.maze):
         mine = list(members)
         settings = pd.DataFrame([run.settings for run in mine], index=[code(run.condition.short) for run in mine])
         for name in settings:
-            is_without = np.array([not getattr(run.condition, name, True) for run in mine])  # such as self_prediction
+            is_without = np.array([not getattr(run.condition, name, True) for run in mine])  # e.g. self_prediction
             values = settings[name][~is_without].dropna().str[: 8 if name == "set" else None]
             found = list(values.value_counts().index)
             if where := [f"{one} in {', '.join(values.index[values == one].unique())}" for one in found[1:]]:

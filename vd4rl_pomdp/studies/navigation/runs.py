@@ -1,4 +1,4 @@
-"""Finished navigation runs: read from run and results folders, as one tidy frame, and kept as a results folder."""
+"""Finished navigation runs: read from run and results folders, as one tidy frame, and saved as a results folder."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, Condition, Measur
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 KEYS = [*Condition._fields, *Measure._fields]
-"""Columns that name a number; all seeds of it make a mean."""
+"""Columns that identify a number; means are over seeds."""
 COLUMNS = [*Condition._fields, "preset", "seed", *Measure._fields, "value"]
-"""Of the frame of runs, and of rows.csv."""
+"""Columns of the frame of runs and of rows.csv."""
 _DRAWN = ("x", "y", "estimated_x", "estimated_y")
-"""Columns of a trajectory that figures and films draw."""
+"""Columns of a trajectory for figures and videos."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class NavigationRun:
     """Its files."""
     condition: Condition
     values: dict[Measure, float]
-    """To six digits, as a table keeps them."""
+    """Values rounded to six digits, as in the tables."""
 
     @property
     def preset(self) -> str:
-        """The preset that it was trained with."""
+        """Its training preset."""
         return self.result.record["config"]["preset"]
 
     @property
@@ -55,14 +55,14 @@ class NavigationRun:
 
     @property
     def identity(self) -> tuple[Any, ...]:
-        """What tells this run from others."""
+        """Identifies this run."""
         return (*self.condition, self.preset, self.seed)
 
     @property
     def settings(self) -> dict[str, str]:
-        """Steps, set, and the settings that change results and are no part of its condition.
+        """Steps, dataset, and settings that change results but are not part of the condition.
 
-        Exogenous images are told by their content. What an untrained network does not do is left out.
+        Exogenous images are identified by content. Settings without effect on an untrained network are left out.
         """
         record, results = self.result.record, self.result.files["results"]
         told = settings_of(record["config"]) | {"steps": self.result.files["timing"]["steps"], "set": results["set"]}
@@ -73,19 +73,19 @@ class NavigationRun:
 
     @property
     def file_name(self) -> str:
-        """Name of its trajectory beside the CSV files."""
+        """File name of its trajectory in a results folder."""
         return f"{self.condition.name.replace('/', '-')}-seed{self.seed}.csv"
 
     @property
     def trajectory(self) -> Path | None:
-        """A held-out trajectory with estimated states: a run folder has one, a results folder may have it."""
+        """A held-out trajectory with estimated states; run folders have one, results folders may."""
         folder = self.result.path
         path = folder / TRAJECTORY_FILE if self.result.folder else folder / TRAJECTORIES / self.file_name
         return path if path.is_file() else None
 
 
 def read_trajectory(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a run's trajectory.csv by name, each (T,) float64; raises UserError for a file that is none."""
+    """Columns of a run's trajectory.csv by name, (T,) float64 each; UserError for an invalid file."""
     try:
         rows = list(csv.DictReader(io.StringIO(read_bytes(path).decode(), newline="")))
         table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
@@ -104,11 +104,11 @@ def find_navigation(sources: Sequence[Path], but: Path | None = None) -> list[Re
 
 
 def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
-    """The finished ones among some runs, in order.
+    """The finished runs, sorted.
 
     Raises:
-        UserError: none is finished, one is damaged, two results are of the same run, seeds of one condition differ in
-            their steps, data or settings, or a value is not finite.
+        UserError: no run is finished, one is damaged, a run occurs twice, seeds of one condition differ in steps, data
+            or settings, or a value is not finite.
     """
     runs = sorted((_read_run(result) for result in results if result.finished), key=lambda run: run.identity)
     if not runs:
@@ -133,7 +133,7 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
 
 
 def _read_run(result: Result) -> NavigationRun:
-    """A finished run from its files; raises UserError where they are damaged."""
+    """Read a finished run; UserError if its files are damaged."""
     try:
         config, results, timing = result.record["config"], result.files["results"], result.files["timing"]
         if missing := sorted({"maze", "set", "command", "rows"} - results.keys()):
@@ -151,7 +151,7 @@ def _read_run(result: Result) -> NavigationRun:
         condition = Condition(
             str(results["maze"]),
             str(config["method"]),
-            int(config.get("max_k", 1)),  # like the other options, of some methods alone
+            int(config.get("max_k", 1)),  # only some methods have it, as with the other options
             config.get("self_prediction", 0.0) > 0,
             config["exogenous"] != "none",
             bool(config.get("literal_future", False)),
@@ -174,18 +174,18 @@ def _read_run(result: Result) -> NavigationRun:
 
 
 def frame_of(runs: Iterable[NavigationRun]) -> pd.DataFrame:
-    """Every number of some runs: one row for each, with COLUMNS."""
+    """Every number of some runs, one per row, with COLUMNS."""
     rows = ((*run.identity, *measure, value) for run in runs for measure, value in run.values.items())
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def conditions_of(frame: pd.DataFrame) -> set[Condition]:
-    """The conditions that have runs."""
+    """The conditions with runs."""
     return {Condition(*row) for row in frame[list(Condition._fields)].drop_duplicates().itertuples(index=False)}
 
 
 def is_missing(condition: Condition, trained: set[Condition]) -> bool:
-    """Whether a condition has no run, although its maze has runs and the same condition has some in another maze."""
+    """Whether a condition has no run, although its maze has runs and another maze has runs of it."""
     return (
         condition not in trained
         and any(other.maze == condition.maze for other in trained)
@@ -194,7 +194,7 @@ def is_missing(condition: Condition, trained: set[Condition]) -> bool:
 
 
 def numbers_of(frame: pd.DataFrame) -> dict[tuple[Any, ...], dict[int, float]]:
-    """Numbers by seed, for each condition and measure: the key is `(*condition, *measure)`."""
+    """Numbers by seed for each condition and measure, with key `(*condition, *measure)`."""
     found: dict[tuple[Any, ...], dict[int, float]] = {}
     keys = frame[KEYS].itertuples(index=False, name=None)
     for key, seed, value in zip(keys, frame["seed"], frame["value"], strict=True):
@@ -203,9 +203,9 @@ def numbers_of(frame: pd.DataFrame) -> dict[tuple[Any, ...], dict[int, float]]:
 
 
 def save_runs(runs: list[NavigationRun], out: Path) -> None:
-    """Write runs as a results folder, from which the report can be made again, with their `trajectories/`.
+    """Write runs as a results folder with `trajectories/`, from which the report can be rebuilt.
 
-    Beside it, `rows.csv` has every value for whoever wants to read them as a table.
+    `rows.csv` also has every value as a table.
     """
     results = [run.result for run in runs]
     refuse_loss(results, out)

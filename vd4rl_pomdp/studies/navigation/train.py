@@ -1,11 +1,11 @@
-"""`vd4rl-pomdp navigation train`: train an objective on a maze beside a state probe, and measure what it knows.
+"""`vd4rl-pomdp navigation train`: train an objective with a state probe on a maze, and measure the probe's errors.
 
-A run folder holds config.json, metrics.jsonl (means over `log_every` steps), encoder/, trajectory.csv and, at its end,
-results.json: every number the report needs, as rows of (measure, split, probe, rows, k, value).
+A run folder holds config.json, metrics.jsonl (means over `log_every` steps), encoder/, trajectory.csv and, at the end,
+results.json: every number for the report, as rows of (measure, split, probe, rows, k, value).
 
-An MLP estimates the true state, standardised (x, y, vx, vy), from a representation: trained beside it, or refitted on
-it frozen. Errors are mean absolute errors in two units: percent of a standard deviation, where predicting the mean
-gives some 65 to 100, and the simulator's own, times 100.
+The probe is an MLP from representations to the standardised true state (x, y, vx, vy). It is trained online beside the
+objective, and refitted on frozen representations. Errors are mean absolute errors in two units: percent of a standard
+deviation, where predicting the mean gives about 65 to 100, and the simulator's units x 100.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _LEARNING_RATE = 1e-3
 
 
 class StateProbe(nn.Module):
-    """Two hidden layers of 256 units: (..., D) representations -> (..., 4) states."""
+    """MLP with two hidden layers of 256 units: (..., D) representations -> (..., 4) states."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -61,12 +61,12 @@ class StateProbe(nn.Module):
         self.net = mlp(dim, 256, STATE_DIM, layers=2)
 
     def forward(self, z: Tensor, frozen: bool = True) -> Tensor:
-        """Estimated states; no gradient reaches the representation unless it is not `frozen`."""
+        """Estimated states; if `frozen`, without gradient to the representation."""
         return self.net(self.standardise(z.detach() if frozen else z))
 
 
 class ErrorSums(nn.Module):
-    """Sums of absolute errors and their counts: over all rows and over hidden ones. Both are part of its state."""
+    """Buffers with sums and counts of absolute errors: over all rows and over hidden ones."""
 
     sums: Tensor
     counts: Tensor
@@ -77,25 +77,23 @@ class ErrorSums(nn.Module):
         self.register_buffer("counts", torch.zeros(2, dtype=torch.float64))
 
     def add(self, estimate: Tensor, truth: Tensor, hidden: Tensor, burn_in: int) -> None:
-        """Count (B, T, 4) estimates against truths, a GPU is not waited for; rows before `burn_in` are left out."""
+        """Add the errors of (B, T, 4) estimates without GPU synchronisation; rows before `burn_in` are left out."""
         error = (estimate.detach().float() - truth)[:, burn_in:].abs().flatten(0, 1)
         under = hidden[:, burn_in:].flatten()
         weights = torch.stack([torch.ones_like(under), under]).to(error)
         self.to(error.device)
-        # in place, as a replayed step adds to the tensors that it was captured with
+        # in place, for CUDA graphs
         self.sums.add_((weights @ error).double())
         self.counts.add_(weights.sum(1).double())
 
     def reset(self) -> None:
-        """Count anew."""
+        """Reset to zero."""
         self.sums.zero_()
         self.counts.zero_()
 
     def both(self, std: Tensor) -> dict[str, float]:
-        """Percent of `state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden.
-
-        Then all of them after RAW_PREFIX in units of the simulator x 100, by the states' (4,) standard deviations.
-        """
+        """`state`, `position`, `velocity` in percent of `std` (4,); with suffix `_hidden` if any counted row was hidden;
+        and all of them with RAW_PREFIX in the simulator's units x 100."""
         sums, counts = self.sums.cpu(), self.counts.cpu()
         return {
             f"{unit}{name}{suffix}": float((100 * scale * sums[number] / counts[number])[part].mean())
@@ -125,15 +123,15 @@ def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
 
 
 _SUPERVISED_RATE = 0.5
-"""Share of the learning rate that supervised references take: at the whole one, two of three seeds predict the mean."""
+"""Factor on the learning rate of supervised references; without it, two of three seeds predict the mean."""
 STAGE = "navigation"
 
 
 class ProbedObjective(Objective):
-    """An objective beside a probe that takes no part in its gradient; the probe's error alone trains a reference."""
+    """An objective with a detached probe; a supervised reference is trained by the probe's error only."""
 
     def __init__(self, data: MazeData, config: NavigationConfig) -> None:
-        """On the CPU, as is `data`."""
+        """Build on the CPU, where `data` is."""
         super().__init__()
         trained = config.trained()
         target = build_target(trained, data.training_actions.numpy())
@@ -144,16 +142,16 @@ class ProbedObjective(Objective):
 
     @property
     def encoder(self) -> Encoder:  # type: ignore[override]
-        """The objective's."""
+        """The objective's encoder."""
         return self.objective.encoder
 
     @property
     def device(self) -> torch.device:
-        """Where it is."""
+        """Device of the parameters."""
         return next(self.parameters()).device
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Objective's and probe's loss of one batch; its errors count until `take_errors`."""
+        """Loss of objective and probe on one batch; errors accumulate until `take_errors`."""
         loss, logs, states = self.measured(window, progress)
         with torch.autocast(self.device.type, enabled=False):
             self.errors.add(*states, self.config.burn_in)
@@ -162,8 +160,8 @@ class ProbedObjective(Objective):
     def measured(
         self, window: Windows, progress: float | Tensor
     ) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
-        """The loss of one batch, whose frames are encoded once, with its estimated and true states and which of them
-        were hidden."""
+        """Loss and logs of one batch, and its estimated states, true states and hidden mask; frames are encoded
+        once."""
         past, future = self.objective.representations(window)
         rows = self.data.dataset.rows(window.key)
         supervised = self.config.method in SUPERVISED
@@ -176,7 +174,7 @@ class ProbedObjective(Objective):
         return loss + error, logs | {"probe_loss": error.detach()}, states
 
     def after_step(self) -> None:
-        """The objective's."""
+        """Call the objective's."""
         self.objective.after_step()
 
     def take_errors(self) -> dict[str, float]:
@@ -187,7 +185,7 @@ class ProbedObjective(Objective):
 
 
 class MazeBatches(WindowSampler):
-    """Uniform training windows of a maze's set: the first ones."""
+    """Uniformly drawn training windows of a maze's dataset."""
 
     def __init__(self, data: MazeData, config: NavigationConfig) -> None:
         draws = random_stream(config.seed, STAGE, "batches", device=data.dataset.t.device)
@@ -196,14 +194,14 @@ class MazeBatches(WindowSampler):
 
 
 def make_trainer(data: MazeData, config: NavigationConfig, device: torch.device) -> tuple[Trainer, ProbedObjective]:
-    """The training of a config on a maze's data, which is moved to the device, and what it trains."""
+    """The trainer of a config and its objective; the data is moved to the device."""
     seed_networks(config.seed, STAGE)
     probed = ProbedObjective(data, config).to(device)
     return Trainer(probed, MazeBatches(data.on(device), config), config, partial(learning_rate, config)), probed
 
 
 def learning_rate(config: NavigationConfig, step: int) -> float:
-    """Adam's learning rate of a step, the first being 0."""
+    """Adam's learning rate at a step, counted from 0."""
     rising = min(1.0, (step + 1) / config.warm_up) if config.warm_up else 1.0
     share = max(0, step - config.warm_up) / max(1, config.steps - config.warm_up)
     falling = (1 + math.cos(math.pi * share)) / 2 if config.schedule == "cosine" else 1.0
@@ -212,11 +210,11 @@ def learning_rate(config: NavigationConfig, step: int) -> float:
 
 
 TRAJECTORY_ROWS = 200
-"""Rows of the held-out trajectory whose estimated states are kept for a figure."""
+"""Rows of the held-out trajectory saved for a figure."""
 
 
 def train(config: NavigationConfig) -> RunFolder:
-    """Run the stage, or resume it; returns the run's folder."""
+    """Run or resume the stage; returns the run's folder."""
     config.check()
     refuse_inside(config.out)
     data = MazeData(config)
@@ -254,7 +252,7 @@ def train(config: NavigationConfig) -> RunFolder:
 
 @torch.no_grad()
 def evaluate(probed: ProbedObjective) -> tuple[dict[str, float], dict[str, float]]:
-    """Action losses, and errors of the probe as trained, on held-out windows."""
+    """Action losses and online probe errors on held-out windows."""
     sums: dict[str, float] = defaultdict(float)
     errors, count = ErrorSums(), 0
     probed.objective.eval()
@@ -270,14 +268,14 @@ def evaluate(probed: ProbedObjective) -> tuple[dict[str, float], dict[str, float
 
 @torch.no_grad()
 def encode(probed: ProbedObjective, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
-    """Frozen states (B, T, D) float32 of windows, and their rows (B, T)."""
+    """Frozen representations (B, T, D) float32 of windows, and their rows (B, T)."""
     window = probed.data.windows(number, length)
     with autocast(probed.device, probed.config.precision):
         return probed.encoder.encode(window).float(), probed.data.dataset.rows(window.key)
 
 
 def refitted_errors(probed: ProbedObjective) -> tuple[StateProbe, dict[str, dict[str, float]]]:
-    """A probe fitted on frozen states of training windows, and its errors by split."""
+    """A probe fitted on frozen representations of training windows, and its errors by split."""
     config, data = probed.config, probed.data
     probed.objective.eval()
     parts = [encode(probed, number) for number in data.spread(config.refit_windows, held_out=False)]
@@ -294,13 +292,13 @@ def refitted_errors(probed: ProbedObjective) -> tuple[StateProbe, dict[str, dict
 
 
 def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
-    """The probe refitted on frozen states, and all rows that `results.json` keeps; `log` is the run's metrics.jsonl.
+    """The refitted probe, and all rows of `results.json`; `log` is the run's metrics.jsonl.
 
-    Action losses are in nats x 100, as in the paper's table: k = 0 stands for the mean over all pairs.
+    Action losses are in nats x 100, as in the paper's table; k = 0 is the mean over all pairs.
     """
     probe, refitted = refitted_errors(probed)
     found = [(split, "refit", errors) for split, errors in refitted.items()]
-    if probed.config.method != UNTRAINED:  # its online probe and its action head were never trained
+    if probed.config.method != UNTRAINED:  # neither its online probe nor its action head was trained
         losses, online = evaluate(probed)
         averages = _training_averages(log, probed.config)
         found += [("held_out", "online", online), ("training", "online", averages)]
@@ -319,7 +317,7 @@ def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[s
 
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
-    """Means over the last `average_last` steps: of the rows that are logged in them, each as often as it has steps."""
+    """Logged metrics averaged over the last `average_last` steps, weighting each row by its steps."""
     before: float = max(0, config.steps - config.average_last)
     sums: dict[str, float] = defaultdict(float)
     counts: dict[str, float] = defaultdict(float)
@@ -333,7 +331,7 @@ def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]
 
 
 def write_trajectory(path: Path, probed: ProbedObjective, probe: StateProbe) -> None:
-    """True and estimated states of the first held-out trajectory, read as one stream."""
+    """Write true and estimated states of the first held-out trajectory, encoded as one sequence."""
     data, dataset = probed.data, probed.data.dataset
     length = min(TRAJECTORY_ROWS, int((dataset.episode_end - dataset.episode_start).min()))
     first = int(dataset.windows_per_episode(length)[: data.first_held_out].sum())

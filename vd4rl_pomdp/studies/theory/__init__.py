@@ -1,4 +1,4 @@
-"""The paper's theory in exact arithmetic: finite worlds small enough to enumerate, and what their enumeration says."""
+"""The paper's theory in exact arithmetic, by enumerating small finite worlds."""
 
 from vd4rl_pomdp.studies.theory.study import theory_study
 from vd4rl_pomdp.studies.theory.world import World, finite_world

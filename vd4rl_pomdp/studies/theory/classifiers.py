@@ -1,4 +1,4 @@
-"""Bayes-optimal classifiers by enumeration: P(a_t | what an objective sees) against P(a_t | states)."""
+"""Bayes-optimal classifiers by enumeration: P(a_t | an objective's inputs) compared with P(a_t | states)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vd4rl_pomdp.studies.theory.world import Action, AgentState, World
 
 @dataclass(frozen=True)
 class MemoryLengths:
-    """Lengths of the windows that stand for past and future."""
+    """Window lengths: m for the past, n for the future."""
 
     m: int
     n: int
@@ -21,7 +21,7 @@ class MemoryLengths:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the Bayes-optimal classifier of one objective is, at one k."""
+    """Properties of one objective's Bayes-optimal classifier at one k."""
 
     k: int
     multi_step: bool
@@ -29,44 +29,45 @@ class Comparison:
     one_step: bool
     """Whether it equals P(a_t | s_t, s_{t+1}) on every sequence."""
     certain: bool
-    """Whether it is 1 for the action taken, always."""
+    """Whether it always assigns probability 1 to the action taken."""
     uniform: bool
-    """Whether it is the same for all actions, always."""
+    """Whether it is always uniform over actions."""
     sees_action: bool
-    """Whether a_t is among what the objective is given."""
+    """Whether a_t is among the objective's inputs."""
     decodes_past: bool
-    """Whether what it sees of the past tells s_t."""
+    """Whether its past inputs determine s_t."""
     decodes_end: bool
-    """Whether what the later representation is computed from tells s_{t+k}."""
+    """Whether the inputs of its later representation determine s_{t+k}."""
     entropy: float
-    """H(a_t | what it sees), in nats."""
+    """H(a_t | inputs), in nats."""
     multi_step_entropy: float
     """H(a_t | s_t, s_{t+k}), in nats."""
 
 
 def first_row(view: ObjectiveView, memory: MemoryLengths) -> int:
-    """The t of a pair that has a whole past window: literal windows reach one action further back."""
+    """First t with a whole past window; literal windows contain one more action."""
     return memory.m + (1 if view.literal and not view.masked else 0)
 
 
 @dataclass(frozen=True)
 class Clash:
-    """One sequence on which an objective's classifier is not the multi-step inverse, and the action it is about."""
+    """A sequence and an action on which an objective's classifier differs from the multi-step inverse."""
 
     k: int
     seen: dict[str, Hashable]
-    """What the objective is given: "o_t", "a_t-1", "o_t+2" and so on."""
+    """The objective's inputs by name: "o_t", "a_t-1", "o_t+2" and so on."""
     states: tuple[AgentState, AgentState]
     """s_t and s_{t+k}."""
     action: Action
     exact: Fraction
-    """Probability of the action given what is seen."""
+    """Probability of the action given the inputs."""
     multi_step: Fraction
-    """P(a_t | s_t, s_{t+k}) of it."""
+    """P(a_t | s_t, s_{t+k}) of the action."""
 
 
 def clash(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> Clash | None:
-    """The sequence on which one objective's classifier is farthest from the multi-step inverse; None if it is that."""
+    """The sequence with the largest difference between an objective's classifier and the multi-step inverse; None if
+    equal."""
     t = first_row(view, memory)
     visible = view.visible(t, k, memory.m, memory.n, t + k + memory.n + 1)
     ends = [("s", t), ("s", t + k)]
@@ -86,7 +87,7 @@ def clash(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> C
 
 
 def compare(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> Comparison:
-    """Compare one objective's classifier at one k with those of the states, on every sequence of the world."""
+    """Compare one objective's classifier at one k with the state-based ones, on every sequence of the world."""
     t = first_row(view, memory)
     rows = t + k + memory.n + 1
     start, end = view.start(t, memory.m), view.end(t, k, memory.m, memory.n, rows)

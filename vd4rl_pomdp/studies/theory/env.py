@@ -1,4 +1,4 @@
-"""Finite worlds to act in and to train on: as Gymnasium environments, and as batches of their exact sequences."""
+"""Finite worlds as Gymnasium environments, and as training batches of their exact sequences."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from vd4rl_pomdp.studies.theory.world import WORLDS, World
 
 
 class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
-    """One world of the gallery; nothing terminates or is rewarded, and the registered ids add the time limit.
+    """A finite world as an environment, without rewards and termination; registered ids add the time limit.
 
-    Observations: (C, 1, 1) uint8, one channel a symbol, 255 for the one that is shown, as in `ExactWindows`. Actions:
-    the place of an action in `world.actions`. `info` holds `state` and `exogenous`, which an agent may not read.
+    Observations: (C, 1, 1) uint8, one channel per symbol, 255 for the observed one, as in `ExactWindows`. Actions:
+    index into `world.actions`. `info` holds `state` and `exogenous`, hidden from the agent.
     """
 
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -38,13 +38,13 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
         self._symbol = self.world.symbols[0]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
-        """Draw a first pair from the world's initial law."""
+        """Draw the first pair from the world's initial distribution."""
         super().reset(seed=seed)
         self._pair = self._draw(self.world.initial)
         return self._show()
 
     def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action and let the exogenous part run; raises UserError for a place that holds none."""
+        """Apply an action and advance the exogenous chain; UserError for an invalid action."""
         if not self.action_space.contains(action):
             last = len(self.world.actions) - 1
             raise UserError(f"action {action}: give the place of one in {list(self.world.actions)}, 0 to {last}")
@@ -55,7 +55,7 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
         return obs, 0.0, False, False, info
 
     def render(self) -> str:
-        """State, exogenous part and observation as text."""
+        """State, exogenous state and observation as text."""
         return f"state {self._pair[0]}, exogenous {self._pair[1]}: shows {self._symbol}"
 
     def _draw(self, law: Mapping[Any, Fraction]) -> Any:
@@ -71,23 +71,23 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
 
 @dataclass(frozen=True)
 class ExactWindows:
-    """Every sequence of `rows` rows that a world can produce, once each, and how likely it is."""
+    """All sequences of `rows` rows in a world, once each, with their probabilities."""
 
     windows: Windows
-    """obs (N, T, C, 1, 1) uint8, one channel a symbol, 0 or 255; actions (N, T, A) float32, one-hot."""
+    """obs (N, T, C, 1, 1) uint8, one channel per symbol, 0 or 255; actions (N, T, A) float32, one-hot."""
     probability: Tensor
     """(N,) float64."""
     state: Tensor
-    """(N, T) int64: place of s_j in the world's states."""
+    """(N, T) int64: index of s_j in the world's states."""
 
     def draw(self, count: int, generator: torch.Generator) -> Windows:
-        """A batch of `count` windows drawn by their probability."""
+        """A batch of `count` windows, drawn by probability."""
         index = torch.multinomial(self.probability, count, replacement=True, generator=generator)
         return self.windows.replace(**{name: self.windows[name][index] for name in self.windows})
 
 
 def exact_windows(world: World, rows: int) -> ExactWindows:
-    """All sequences of a world that begin in its initial law; windows end inside their episode, as in training."""
+    """All sequences from a world's initial distribution; windows end within their episode, as in training."""
     law = joint_law(world, [(kind, j) for kind in ("s", "o", "a") for j in range(rows)])
     shown, acted, state = (np.stack([law.column((kind, j)) for j in range(rows)], axis=1) for kind in ("o", "a", "s"))
     obs = torch.from_numpy(255 * np.eye(len(world.symbols), dtype=np.uint8)[shown])

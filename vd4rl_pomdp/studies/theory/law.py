@@ -1,9 +1,8 @@
-"""The exact joint law of observations, actions and states of a finite world's sequences, as integer counts.
+"""Exact joint distributions of the observations, actions and states of a finite world, as integer counts.
 
-The probabilities of a table are written with one denominator. All sequences of one length then have one denominator,
-too, and a law is a list of distinct sequences with an integer for each, its numerator. Sequences are extended row by
-row, as arrays; variables that no one asked for are summed out at once, so masked steps cost nothing. Integers are 64
-bits wide where that suffices and unbounded where it does not.
+All probabilities of a table have a common denominator, so all sequences of one length have one, too. A law is a list of
+distinct sequences with integer numerators. Sequences are extended row by row as arrays; variables that are not needed
+are summed out at once, so masked steps cost nothing. Integers have 64 bits if that suffices, else Python's precision.
 """
 
 from __future__ import annotations
@@ -24,40 +23,40 @@ Variable = tuple[str, int]
 Prediction = tuple[Fraction, ...]
 """Probability of every action, in the world's order."""
 KINDS = ("s", "xi", "o", "a")
-"""Order of the variables of one row."""
+"""Order of the variables in a row."""
 LARGEST = 2**62
 
 
 @dataclass(frozen=True)
 class Law:
-    """The joint law of some variables: distinct joint values, as codes, and how often each occurs."""
+    """Joint distribution of some variables: distinct joint values as codes, with counts."""
 
     variables: tuple[Variable, ...]
     codes: np.ndarray
-    """(N, V) int32: places in `names`."""
+    """(N, V) int32: indices into `names`."""
     counts: np.ndarray
     """(N,) integers."""
     names: dict[str, tuple[Hashable, ...]]
-    """What the codes of a kind of variable stand for."""
+    """Values by kind of variable, indexed by code."""
 
     def values(self, group: Iterable[Variable], rows: np.ndarray | slice | list[int]) -> list[tuple]:
-        """Joint values of a group of variables, `in_order`, at some of the N rows."""
+        """Joint values of some variables, `in_order`, at some of the N rows."""
         columns = [[self.names[kind][c] for c in self.column((kind, j))[rows]] for kind, j in in_order(group)]
         return list(zip(*columns, strict=True)) if columns else [()] * len(self.counts[rows])
 
     def numbered(self, group: Iterable[Variable]) -> tuple[np.ndarray, np.ndarray]:
-        """The number of the joint value of a group at each row, (N,) int64, and the first row that has each."""
+        """Index of the joint value of some variables at each row, (N,) int64, and the first row of each."""
         return number_rows([self.column(v) for v in in_order(group)])
 
     def given(self, group: Iterable[Variable], action: Variable) -> Conditional:
-        """The conditional law of an action given a group of variables."""
+        """Conditional distribution of an action given some variables."""
         ids, first = self.numbered(group)
         counts = np.zeros((len(first), len(self.names["a"])), self.counts.dtype)
         np.add.at(counts, (ids, self.column(action)), self.counts)
         return Conditional(ids, first, counts)
 
     def tells(self, group: Iterable[Variable], value: Iterable[Variable]) -> bool:
-        """Whether some variables are a function of a group."""
+        """Whether a group of variables determines others."""
         (ids, first), (told, _) = self.numbered(group), self.numbered(value)
         return bool((told == told[first][ids]).all())
 
@@ -68,45 +67,45 @@ class Law:
 
 @dataclass(frozen=True)
 class Conditional:
-    """P(a | view): which view each row of a law has, and how often each action goes with each view."""
+    """P(a | view): the view of each row of a law, and action counts by view."""
 
     ids: np.ndarray
     """(N,) int64."""
     first: np.ndarray
-    """(views,) int64: the first row of each view."""
+    """(views,) int64: first row of each view."""
     counts: np.ndarray
     """(views, actions) integers."""
 
     @cached_property
     def kinds(self) -> tuple[np.ndarray, list[Prediction]]:
-        """Which of the distinct predictions belongs to each view, and those predictions."""
+        """(views,) index into the distinct predictions, and these predictions."""
         rows = [np.unique(column, return_inverse=True)[1] for column in self.counts.T]
         kinds, first = number_rows(rows)
         distinct = [tuple(Fraction(n, sum(row)) for n in row) for row in self.counts[first].astype(object).tolist()]
         return kinds, distinct
 
     def by_row(self) -> list[Prediction]:
-        """The prediction at each of the law's N rows."""
+        """The prediction at each of the N rows."""
         kinds, distinct = self.kinds
         return [distinct[kind] for kind in kinds[self.ids]]
 
     def agrees(self, other: Conditional) -> bool:
-        """Whether two classifiers say the same wherever their views occur together."""
+        """Whether two classifiers agree on every row."""
         (mine, one), (theirs, two) = self.kinds, other.kinds
         mine, theirs = mine[self.ids], theirs[other.ids]
         first = number_rows([mine, theirs])[1]
         return all(one[i] == two[j] for i, j in zip(mine[first], theirs[first], strict=True))
 
     def certain(self) -> bool:
-        """Whether the action is known, whatever the view."""
+        """Whether every view determines the action."""
         return all(max(p) == 1 for p in self.kinds[1])
 
     def uniform(self) -> bool:
-        """Whether no action is more likely than another, whatever the view."""
+        """Whether all actions are equally likely under every view."""
         return all(len(set(p)) == 1 for p in self.kinds[1])
 
     def entropy(self) -> float:
-        """H(a | view) in nats; the only number here that is rounded."""
+        """H(a | view) in nats; the only rounded number here."""
         kinds, distinct = self.kinds
         weights = np.zeros(len(distinct), object)
         np.add.at(weights, kinds, self.counts.astype(object).sum(1))
@@ -115,16 +114,16 @@ class Conditional:
 
 
 def joint_law(world: World, variables: Iterable[Variable]) -> Law:
-    """Exact joint law of some variables of a sequence that starts in the world's initial law."""
+    """Exact joint distribution of some variables of a sequence that starts in the world's initial distribution."""
     wanted = in_order(set(variables))
     rows = 1 + max(row for _, row in wanted)
     step, initial, policy, drift, emission = _tables(world)
     total = initial.total * (policy.total * drift.total * emission.total) ** rows
     counts = initial.weights[0].astype(np.int64 if total < LARGEST else object)
-    columns = list(np.divmod(initial.entries[0], len(world.exogenous)))  # the present pair, then what is kept
+    columns = list(np.divmod(initial.entries[0], len(world.exogenous)))  # the current pair, then the recorded ones
 
     def branch(table: _Table, row: np.ndarray) -> None:
-        """Split every sequence by what may come next, by its row of a table; each branch's entry is another column."""
+        """Branch every sequence over the outcomes of its table row, which become another column."""
         nonlocal counts
         weights = table.weights.astype(counts.dtype)
         parent, nth = np.nonzero(weights[row])
@@ -132,7 +131,7 @@ def joint_law(world: World, variables: Iterable[Variable]) -> Law:
         counts = counts[parent] * weights[row[parent], nth]
 
     def merge(keys: list[np.ndarray]) -> None:
-        """Add up sequences that are alike in some columns."""
+        """Merge sequences with equal keys by adding their counts."""
         nonlocal counts
         ids, first = number_rows(keys)
         before, counts = counts, np.zeros(len(first), counts.dtype)
@@ -157,7 +156,7 @@ def joint_law(world: World, variables: Iterable[Variable]) -> Law:
 
 
 class _Table:
-    """Laws of what comes next, with one common denominator: for each row, entries and their weights."""
+    """Distributions with a common denominator: for each row, outcomes and integer weights."""
 
     def __init__(self, laws: Sequence[Mapping[Any, Fraction]], names: Sequence[Hashable]) -> None:
         scale = lcm(*(p.denominator for law in laws for p in law.values()))
@@ -174,7 +173,7 @@ class _Table:
 
 @lru_cache(maxsize=16)
 def _tables(world: World) -> tuple[np.ndarray, _Table, _Table, _Table, _Table]:
-    """A world as numbers: next states (S, A), and the laws of the first pair, the action, the drift and the symbol."""
+    """A world as arrays: next states (S, A), and tables of the first pair, action, drift and symbol."""
     states, noises, actions = world.states, world.exogenous, world.actions
     pairs = [(s, xi) for s in states for xi in noises]
     return (
@@ -190,7 +189,7 @@ def number_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Number the distinct rows of some (N,) columns of small integers.
 
     Returns:
-        (N,) int64, the number 0, 1, ... of each row, and the first row that has each number.
+        (N,) int64, the number 0, 1, ... of each row, and the first row with each number.
     """
     ids, distinct = np.zeros(len(columns[0]), np.int64), 1
     for column in columns:
@@ -204,5 +203,5 @@ def number_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_order(group: Iterable[Variable]) -> list[Variable]:
-    """Variables by row, and within a row in the order of `KINDS`."""
+    """Sort variables by row, then by `KINDS`."""
     return sorted(group, key=lambda variable: (variable[1], KINDS.index(variable[0])))

@@ -1,12 +1,12 @@
-"""What an objective needs of its representation: the coarsest partitions of histories that determine its predictions.
+"""Requirements of an objective on its representation: coarsest partitions of histories that determine its predictions.
 
-At its optimum an objective knows F_k(x, y) = P(a_t | x, y) for every history x and later view y that occur together. A
-representation phi is enough if F_k is a function of phi(x) and phi(y) (of phi(x) and y, where the later view is one of
-the future and has an encoder of its own). Every refinement of such a phi is enough, too, so:
+At its optimum, an objective knows F_k(x, y) = P(a_t | x, y) for every history x and later view y that occur together. A
+representation phi is sufficient if F_k is a function of phi(x) and phi(y) (of phi(x) and y, if the later view is a
+future with its own encoder). Every refinement of a sufficient phi is sufficient. So:
 
-- two histories *must differ* if putting just these two together contradicts F: no optimal representation merges them;
-- a partition is *coarsest* if no two of its blocks can be put together. F is silent about pairs that never occur
-  together, so there may be several; they are found by first fit, from more than one order, and the smallest is shown.
+- two histories *must differ* if merging just these two contradicts F: no optimal representation merges them;
+- a partition is *coarsest* if no two of its blocks can be merged. F is undefined for pairs that never occur together,
+  so there may be several; first fit from more than one order finds some, and the smallest is used.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vd4rl_pomdp.studies.theory.views import ObjectiveView
 from vd4rl_pomdp.studies.theory.world import World
 
 History = tuple
-"""Values of what a representation is computed from, oldest first."""
+"""Inputs of a representation, oldest first."""
 
 
 class Relation:
@@ -33,16 +33,16 @@ class Relation:
     def __init__(self, world: World, shared: bool) -> None:
         self.world = world
         self.shared = shared
-        """Whether one representation serves both ends."""
+        """Whether one representation encodes both ends."""
         self.histories: dict[History, int] = {}
         self.acted: dict[int, tuple] = {}
-        """History -> the actions it shows, oldest first."""
+        """Actions in a history, oldest first."""
         self._laters: dict[tuple, int] = self.histories if shared else {}
         self._contents: dict[tuple, int] = {}
         self._predictions: dict[Prediction, int] = {}
         self._entries: list[np.ndarray] = []
         self.facts: dict[str, list[np.ndarray]] = {"s": [], "xi": [], "content": []}
-        """Parts of (P, 2): each history with each agent-centric state, exogenous state and content it may have."""
+        """Parts of (P, 2): each history with each possible agent-centric state, exogenous state and content."""
 
     def add(self, law: Law, start: Iterable[Variable], end: Iterable[Variable], t: int, k: int) -> None:
         """Record F_k from a law of both views and a_t."""
@@ -53,12 +53,12 @@ class Relation:
         self._entries.append(np.stack([np.full_like(past, k), past, later, values]))
 
     def add_facts(self, law: Law, past: Iterable[Variable], content: Iterable[Variable], row: int) -> None:
-        """Record the states, exogenous states and contents that histories which end at a row may have.
+        """Record the possible states, exogenous states and contents of histories that end at a row.
 
         Args:
             law: of `past`, `content` and the s and xi of `row`.
-            past: what histories consist of.
-            content: their agent-centric content: the states of the rows they show, and the actions they show.
+            past: variables of the histories.
+            content: their agent-centric content: the states of their rows, and their actions.
             row: their last row.
         """
         history = _numbers(self.histories, past, law)
@@ -77,12 +77,12 @@ class Relation:
 
     @cached_property
     def states(self) -> np.ndarray:
-        """(H, S) bool: agent-centric states that a history may end in; one, if it decodes."""
+        """(H, S) bool: possible final agent-centric states of a history; exactly one if it decodes the state."""
         return self._incidence("s", len(self.world.states))
 
     @cached_property
     def noises(self) -> np.ndarray:
-        """(H, X) bool: exogenous states that a history may end in."""
+        """(H, X) bool: possible final exogenous states of a history."""
         return self._incidence("xi", len(self.world.exogenous))
 
     def _incidence(self, kind: str, width: int) -> np.ndarray:
@@ -91,13 +91,13 @@ class Relation:
         return table
 
     def conflicts(self) -> np.ndarray:
-        """(H, H) bool: pairs of histories that every representation that is enough keeps apart."""
+        """(H, H) bool: pairs of histories that every sufficient representation separates."""
         k, past, later, value = self.entries
         found = np.zeros((len(self.histories),) * 2, bool)
         _mark_differing(found, past, number_rows([k, later])[0], value)
         if self.shared:
             _mark_differing(found, later, number_rows([k, past])[0], value)
-            for each in np.unique(k):  # put together, two histories would need several predictions for one pair
+            for each in np.unique(k):  # merged, two histories would need several predictions for one pair
                 table = np.full(found.shape, -1, np.int32)
                 table[past[k == each], later[k == each]] = value[k == each]
                 loop = table.diagonal()
@@ -108,13 +108,13 @@ class Relation:
         return found | found.T
 
     def factors(self, codes: np.ndarray) -> bool:
-        """Whether F is a function of the codes of both sides; codes (H,) integers."""
+        """Whether F is a function of both sides' codes; codes (H,) integers."""
         k, past, later, value = self.entries
         key, first = number_rows([k, codes[past], codes[later] if self.shared else later])
         return bool((value == value[first][key]).all())
 
     def coarsest(self) -> np.ndarray:
-        """(H,) integers: a coarsest partition, the smallest of those that the orders lead to."""
+        """(H,) integers: the smallest of the coarsest partitions found."""
         names = np.fromiter(self.world.states, object, len(self.world.states))
         ends = [repr(sorted(names[row], key=repr)) for row in self.states]
         recent = [repr(self.acted[h][::-1]) for h in range(len(ends))]
@@ -122,10 +122,10 @@ class Relation:
         return min(found, key=lambda blocks: len(set(blocks)))
 
     def _first_fit(self, groups: Sequence[str], ends: Sequence[str]) -> np.ndarray:
-        """Blocks by first fit: at first within groups (of equal states, or of equal actions), then across them.
+        """Blocks by first fit: first within groups (equal states, or equal actions), then across them.
 
-        Each block is named by its first member, and has its row of the tables of F: (K, H, L), the prediction for every
-        k, history and other side, -1 where they never occur together.
+        A block is named by its first member, which keeps its row of the tables of F, (K, H, L): prediction for every k,
+        history and other side, -1 for pairs that never occur.
         """
         k, past, later, value = self.entries
         place = np.unique(k, return_inverse=True)[1]
@@ -143,7 +143,7 @@ class Relation:
             return not (_differ(tables[:, :, both], axis=2) or _differ(between, axis=1))
 
         def join(order: Iterable[int], within: bool) -> list[int]:
-            """Put every block, in order, into the first earlier one that it may join and fits; returns what is left."""
+            """Merge every block, in order, into the first earlier one that is allowed and fits; returns the others."""
             heads: list[int] = []
             for name in order:
                 mates = (h for h in heads if (not within or groups[h] == groups[name]) and fit(h, name))
@@ -152,7 +152,7 @@ class Relation:
                     continue
                 parent[parent == name] = head
                 for side in (tables, tables.swapaxes(1, 2)) if self.shared else (tables,):
-                    side[:, head] = np.maximum(side[:, head], side[:, name])  # equal where both have an entry
+                    side[:, head] = np.maximum(side[:, head], side[:, name])  # where both have an entry, they are equal
                     side[:, name] = -1
             return heads
 
@@ -162,19 +162,19 @@ class Relation:
 
 
 def _differ(values: np.ndarray, axis: int) -> bool:
-    """Whether known values (those that are not -1) differ anywhere along an axis."""
+    """Whether known values (not -1) differ anywhere along an axis."""
     low = np.where(values < 0, values.max(initial=0), values).min(axis)
     return bool((low < values.max(axis)).any())
 
 
 def _numbers(known: dict[tuple, int], group: Iterable[Variable], law: Law) -> np.ndarray:
-    """(N,) numbers of the joint values of a group; values that are not known yet get the next ones."""
+    """(N,) numbers of the joint values of a group; new values get the next numbers."""
     ids, first = law.numbered(group)
     return np.array([known.setdefault(name, len(known)) for name in law.values(group, first)])[ids]
 
 
 def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value: np.ndarray) -> None:
-    """Mark each two of (E,) entries that have one key and two values."""
+    """Mark all pairs of (E,) entries with equal keys and different values."""
     order = np.argsort(key, kind="stable")
     mine, key, value = mine[order], key[order], value[order]
     for gap in range(1, int(np.bincount(key).max())):
@@ -185,8 +185,8 @@ def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value:
 def relation(world: World, view: ObjectiveView, memory: MemoryLengths, ks: Iterable[int]) -> Relation:
     """F of one objective on a world, for some k.
 
-    Where the past is a window, one t with a whole window stands for all. Where it is the whole history, every pair
-    within the rows m..m+K is taken, because one late history must serve all earlier t.
+    For windowed pasts, one t with a whole window represents all. For whole histories, every pair within rows m..m+K is
+    used, since one late history must serve all earlier t.
     """
     ks, first = list(ks), first_row(view, memory)
     found, histories = Relation(world, shared=not view.masked), {}
@@ -215,12 +215,12 @@ def state_relation(world: World, ks: Iterable[int]) -> Relation:
 
 
 def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
-    """For every pair of states, the share of pairs of their histories that every optimal representation separates.
+    """For every pair of states, the fraction of pairs of their histories that every optimal representation separates.
 
-    Only histories that may have the same exogenous state are paired: others can be told apart by what the future shows
-    of the exogenous state.
+    Only histories that may have the same exogenous state are paired: others may be distinguishable by the exogenous
+    part of the future.
     """
-    ends, noises = found.states.astype(float), found.noises.astype(float)  # whole numbers, far below 2^53: exact
+    ends, noises = found.states.astype(float), found.noises.astype(float)  # integers far below 2^53: exact
     eligible = noises @ noises.T > 0
     possible, forced = (ends.T @ pairs.astype(float) @ ends for pairs in (eligible, found.conflicts() & eligible))
     names = found.world.states
@@ -231,14 +231,14 @@ def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
 
 
 def discards_noise(found: Relation) -> bool:
-    """Whether F depends on the agent-centric content of histories alone, so that what differs in noise can be one."""
+    """Whether F depends only on the agent-centric content of histories, so that noise can be discarded."""
     return found.factors(_linked(np.concatenate(found.facts["content"])))
 
 
 def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
-    """Class of each state: states that a partition of histories cannot tell apart share one.
+    """Class of each state: states that a partition of histories cannot distinguish share one.
 
-    They share a block at an equal exogenous state, directly or through others.
+    These share a block at an equal exogenous state, directly or through others.
     """
     history, noise = np.nonzero(found.noises)
     table = np.zeros((found.states.shape[1], int(blocks.max()) + 1, found.noises.shape[1]), bool)
@@ -249,7 +249,7 @@ def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
 
 
 def _linked(pairs: np.ndarray) -> np.ndarray:
-    """Classes of the left numbers of (P, 2) pairs: those that share a right number, directly or through others."""
+    """Connected components of the left numbers of (P, 2) pairs, linked by equal right numbers."""
     left, right = pairs.T
     label = np.arange(int(left.max()) + 1)
     while True:

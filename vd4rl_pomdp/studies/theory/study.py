@@ -1,4 +1,5 @@
-"""What `vd4rl-pomdp theory` computes: the paper's Table 1 and equations beside enumeration on the gallery's worlds."""
+"""Computations of `vd4rl-pomdp theory`: the paper's Table 1 and equations, compared with enumeration on small
+worlds."""
 
 from __future__ import annotations
 
@@ -38,14 +39,14 @@ from vd4rl_pomdp.studies.theory.world import (
 
 MAX_K = 10
 GAPS = 4
-"""How many k are tried, from the first one that a statement is about."""
+"""Number of k to try, from the first one to which a statement applies."""
 
 
 def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Action, ...], AgentState]]:
-    """Every (s_t, (a_t..a_{t+k-1}), s_{t+k}).
+    """All (s_t, (a_t..a_{t+k-1}), s_{t+k}).
 
-    The paper's counterexample is about these (section 3.2 and appendix): it generates all of them for k = 1..10 and
-    asks, for each pair of states, how the first action is distributed.
+    As in the paper's counterexample (section 3.2 and appendix), which generates them for k = 1..10 and considers the
+    distribution of the first action for each pair of states.
     """
     found = []
     for start in world.states:
@@ -58,7 +59,7 @@ def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Actio
 
 
 def examples_by_k(world: World) -> list[dict[str, int]]:
-    """One row for every k: examples, pairs of states, and at how many of them the first action is known or uniform."""
+    """One row per k: number of examples and state pairs, and of pairs with a certain or uniform first action."""
     rows = []
     for k in range(1, MAX_K + 1):
         first: dict[tuple[AgentState, AgentState], Counter[Action]] = {}
@@ -72,7 +73,7 @@ def examples_by_k(world: World) -> list[dict[str, int]]:
 
 
 def enumerated(world: World) -> dict[str, Any]:
-    """What enumeration says of the counterexample, with one of the paper's two action sets."""
+    """Enumeration of the counterexample with one of the paper's two action sets."""
     rows = examples_by_k(world)
     return {
         "actions": list(world.actions),
@@ -91,7 +92,7 @@ def enumerated(world: World) -> dict[str, Any]:
 
 
 def least_memory(world: World) -> MemoryLengths:
-    """The least m and n with actions; where no n decodes, that of the literal reading, or 0 if none does either."""
+    """Smallest decoding m and n with actions; if no n decodes, the literal reading's, or 0 if it has none."""
     m = past_memory(world, actions=True)
     ns = [future_memory(world, actions=True, literal=literal) for literal in (False, True)]
     assert m is not None, f"{world.name}: no past decodes"
@@ -102,14 +103,14 @@ INVERSE = "P(a_t | s_t, s_{t+k})"
 
 
 def facts() -> list[Row]:
-    """Where text and enumeration differ: a number as a statement of the paper has it and as it is, world by world.
+    """Differences between text and enumeration: one row per world that shows one.
 
     Every world meets the assumptions of the statement that it contradicts. Window lengths m and n are the least that
     decode.
 
     Returns:
-        rows of `title` (what is true), `printed` (what the paper prints, and where), `world`, `quantity`, `claimed` and
-        `computed`, all of them text; the rows of one title stand together.
+        rows of `title` (the true statement), `printed` (the paper's, and where), `world`, `quantity`, `claimed` and
+        `computed`, all text.
     """
     theirs, main = counterexample(), counterexample((0, 1))
     third, even = examples_by_k(theirs)[2], ", ".join(map(str, enumerated(main)["uniform_k"]))
@@ -177,7 +178,7 @@ def facts() -> list[Row]:
 
 
 def _prediction(world: World, method: str, first_k: int) -> tuple[str, str, str, str]:
-    """The first k, of GAPS, at which a method is not the multi-step inverse: where, and both probabilities."""
+    """The first k, of GAPS, at which a method differs from the multi-step inverse: where, and both probabilities."""
     memory = least_memory(world)
     for k in range(first_k, first_k + GAPS):
         if found := clash(world, VIEWS[method], memory, k):
@@ -188,7 +189,7 @@ def _prediction(world: World, method: str, first_k: int) -> tuple[str, str, str,
 
 
 def _jumps(world: World) -> tuple[str, str, str, str]:
-    """States that FJ+A tells apart by jumps beyond m, beside those by shorter ones and by the literal MIK+A."""
+    """State pairs that FJ+A separates with jumps beyond m, compared with shorter ones and with the literal MIK+A."""
     m = least_memory(world).m
     near, far = (always_apart(relation(world, VIEWS["fj+a"], MemoryLengths(m, m), range(1, k + 1))) for k in (m, m + 2))
     masked = always_apart(relation(world, VIEWS["mik+a literal"], MemoryLengths(m, m), range(1, m + 1)))
@@ -197,20 +198,20 @@ def _jumps(world: World) -> tuple[str, str, str, str]:
 
 
 def _merged(world: World) -> tuple[str, str, str, str]:
-    """States that MIK+A's past encoder has to tell apart, with both actions equally likely."""
+    """State pairs that MIK+A's past encoder must separate, with both actions equally likely."""
     reach = _reach(world)
     apart, pairs = always_apart(relation(world, VIEWS["mik+a"], least_memory(world), range(1, reach + 1)))
     return world.name, f"pairs of states apart by mik+a, k up to {reach}", f"{pairs} of {pairs}", f"{apart} of {pairs}"
 
 
 def _codes(world: World) -> tuple[str, str, str, str]:
-    """Codes that one encoder on true states needs at both ends, at every k up to twice the diameter."""
+    """Codes that a shared encoder on true states needs for every k up to twice the diameter."""
     codes = len(set(state_relation(world, range(1, 2 * _reach(world) + 1)).coarsest().tolist()))
     return world.name, f"codes on true states, k up to {2 * _reach(world)}", str(len(world.states)), str(codes)
 
 
 def _noise(world: World) -> tuple[str, str, str, str]:
-    """The first of two k beyond m up to which FJ+A's prediction depends on the exogenous part of its past."""
+    """The first of two maximum k beyond m at which FJ+A's prediction depends on the exogenous part of its past."""
     memory = least_memory(world)
     for k in (memory.m + 1, memory.m + 2):
         if not discards_noise(relation(world, VIEWS["fj+a"], memory, range(1, k + 1))):
@@ -219,7 +220,7 @@ def _noise(world: World) -> tuple[str, str, str, str]:
 
 
 def always_apart(found: Relation) -> tuple[int, int]:
-    """Pairs of states all of whose histories every optimal representation separates, and all pairs."""
+    """Number of state pairs that every optimal representation separates for all histories, and of all pairs."""
     shares = forced_shares(found).values()
     return sum(share == 1 for share in shares), len(shares)
 
@@ -243,7 +244,7 @@ DIAGRAMS = (("fj", 3), ("fj+a", 3), ("fj+a", 5), ("mik+a", 3), ("mik+a literal",
 
 
 def theory_study() -> dict[str, Any]:
-    """Compute the counterexample's numbers, Table 1, the equations, the facts and the merged states, JSON-ready."""
+    """Compute counterexample, Table 1, equations, facts and merged states, JSON-serialisable."""
     worlds, rows, needs = zip(*(_of_world(name, make()) for name, make in WORLDS.items()), strict=True)
     described = dict(zip(WORLDS, worlds, strict=True))
     rows, needs = [row for some in rows for row in some], [row for some in needs for row in some]
@@ -267,14 +268,14 @@ def theory_study() -> dict[str, Any]:
 
 
 def _of_world(name: str, world: World) -> tuple[Row, list[Row], list[Row]]:
-    """What is computed on a world of the gallery and its variants.
+    """Results on a world and its variants.
 
     Returns:
-        its sizes, decodability with and without actions, diameter and period; the largest k is the diameter, or m + 2
-        if that is more. Then what classifiers are, one row for every variant, method and k: with noise, k goes to the
-        diameter only, as sequences are many more. Then which pairs of states are forced apart, and whether noise can
-        be dropped, one row for every policy and method: k goes up to the diameter; methods that do not see the whole
-        history have a second row where the largest k is more.
+        sizes, decodability with and without actions, diameter, period, and the maximum k, max(diameter, m + 2).
+        Comparisons: one row per variant, method and k. With noise, k stops at the diameter, since there are many more
+        sequences.
+        Representations: one row per policy and method: state pairs that must be separated, and whether noise can be
+        discarded. k goes up to the diameter; methods without the whole history have a second row up to the maximum k.
     """
     memory, reach = least_memory(world), diameter(world)
     assert reach is not None
@@ -315,7 +316,7 @@ def _of_world(name: str, world: World) -> tuple[Row, list[Row], list[Row]]:
 
 
 def method_row(world: str, method: str, rows: list[Row], needs: list[Row]) -> Row:
-    """Table 1's row of one method on one world, from all comparisons and representations.
+    """A method's row of Table 1 on one world, from all comparisons and representations.
 
     A property is true if it holds in every variant and at every k; for representations, up to the largest k.
     """
@@ -353,12 +354,11 @@ EQUATIONS = (
     ("mik+a", "every k", "multi_step"),
     ("mik+a literal", "every k", "multi_step"),
 )
-"""Closed forms that section 3.1 states for classifiers: a method, one of RANGES, and one of FORMS, which are fields of
-`Comparison`."""
+"""Closed forms of classifiers in section 3.1: a method, one of RANGES, and one of FORMS (fields of `Comparison`)."""
 
 
 def compare_equations(rows: list[Row], memories: dict[str, int]) -> list[Row]:
-    """For every equation and world: at which of its k it holds or fails, and whether its assumptions are met."""
+    """For every equation and world: the k at which it holds or fails, and whether its assumptions are met."""
     found = []
     for (method, where, form), (world, m) in product(EQUATIONS, memories.items()):
         mine = [row for row in rows if (row["world"], row["method"]) == (world, method) and RANGES[where](row["k"], m)]
@@ -371,9 +371,9 @@ def compare_equations(rows: list[Row], memories: dict[str, int]) -> list[Row]:
 
 
 def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]:
-    """Entries of Table 1, and equations, that a world contradicts which meets the method's assumptions.
+    """Entries of Table 1 and equations that are contradicted by a world that meets the method's assumptions.
 
-    A printed no says that a property is not guaranteed, so a world that has the property does not contradict it.
+    A printed no means that a property is not guaranteed, so a world with the property does not contradict it.
     """
     found = []
     for world, table in tables.items():
@@ -383,7 +383,7 @@ def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]
                 "complete": f"{row['forced']} of {row['pairs']} pairs of states are always told apart",
                 "discards": "the past's code must carry part of the exogenous state",
             }
-            told = PRINTED[row["method"].removesuffix(" literal")]  # a literal reading is held against the same row
+            told = PRINTED[row["method"].removesuffix(" literal")]  # literal readings share it
             failed = [column for column in computed if told[column] and not row[column]]
             found += [(world, row["method"], column, computed[column]) for column in failed]
     for row in (row for row in equations if row["fails_k"] and row["decodes"]):
@@ -393,7 +393,7 @@ def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]
 
 
 def diagrams(world: World, most: int) -> list[Row]:
-    """For some objectives, a world's states in classes that a coarsest partition cannot tell apart."""
+    """For some objectives, the classes of a world's states that a coarsest partition cannot distinguish."""
     memory, rows = least_memory(world), []
     relations = {
         f"{method}, k <= {max_k}": relation(world, VIEWS[method], memory, range(1, max_k + 1))

@@ -1,7 +1,7 @@
 """Which variables each inverse objective of the paper's Table 1 sees when it predicts a_t for the pair (t, t+k).
 
 The learned objectives declare the same in `InverseObjective.visible`, and a test compares the two. Here a view has two
-parts, one for each of the two representations that the prediction is made from.
+parts, one for each of the two representations.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ class ObjectiveView:
 
     name: str
     past: Literal["none", "all", "window"]
-    """Rows before t that are seen (and before t+k, if the later representation is one of the past): none, all, or m."""
+    """Rows before t that are seen (and before t+k, if the later representation encodes a past): none, all, or m."""
     actions: bool = False
     """Whether actions are seen."""
     masked: bool = False
-    """Whether the later representation is one of the future from t+k on, by an encoder of its own."""
+    """Whether the later representation encodes the future from t+k on, with its own encoder."""
     literal: bool = False
-    """Whether a window's first row, too, comes with the action before it, as the paper's formulas read."""
+    """Whether a window's first row also contains the action before it, as the paper's formulas read."""
 
     def start(self, t: int, m: int) -> frozenset[Variable]:
-        """What the representation of row t is computed from."""
+        """Inputs of the representation at row t."""
         first = {"none": t, "all": 0, "window": max(0, t - m)}[self.past]
         earlier = first - 1 if self.literal and not self.masked else first
         return _variables(range(first, t + 1), range(max(0, earlier), t) if self.actions else ())
 
     def end(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
-        """What the representation of row t+k is computed from, in a window of `rows` rows.
+        """Inputs of the representation at row t+k, in a window of `rows` rows.
 
-        A future of n rows beyond t+k holds n+1 actions, as `MaskedInverse` reads it.
+        A future of n rows beyond t+k contains n+1 actions, as in `MaskedInverse`.
         """
         if not self.masked:
             return self.start(t + k, m)
@@ -45,7 +45,7 @@ class ObjectiveView:
         return _variables(range(t + k, last), actions)
 
     def visible(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
-        """Everything a prediction may depend on."""
+        """All inputs of a prediction."""
         return self.start(t, m) | self.end(t, k, m, n, rows)
 
 
@@ -67,5 +67,6 @@ VIEWS = {
         ObjectiveView("mik+a literal", "window", actions=True, masked=True, literal=True),
     )
 }
-"""Every view by the name of its method. Literal are rows (o_t, a_{t-1}), as the paper defines them: those of the future
-in `mik+a literal`, those of the past in `fj+a literal`."""
+"""Views by method. Literal rows are (o_t, a_{t-1}), as the paper defines them: rows of the future in `mik+a literal`,
+of the past in `fj+a literal`.
+"""

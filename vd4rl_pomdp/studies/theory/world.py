@@ -1,16 +1,16 @@
-"""A small language for finite agent-centric FM-POMDPs (Wu et al., arXiv 2404.14552, section 2), in exact arithmetic.
+"""Finite agent-centric FM-POMDPs (Wu et al., arXiv 2404.14552, section 2) in exact arithmetic.
 
-A world has agent-centric states s with deterministic dynamics, an exogenous chain xi that no action touches, an
-emission of the pair, and a policy that reads s alone:
+A world has agent-centric states s with deterministic dynamics, an exogenous chain xi independent of actions, an
+emission of the pair, and a policy that depends on s only:
 
     row      0                1                2
     pair     (s_0, xi_0) ---> (s_1, xi_1) ---> (s_2, xi_2)       s_{t+1} = step(s_t, a_t),  xi_{t+1} ~ drift(xi_t)
     seen     o_0              o_1              o_2               o_t ~ emit(s_t, xi_t)
     action          a_0              a_1              a_2        a_t ~ policy(s_t)
 
-Probabilities are fractions; `law` turns a world into exact joint laws of sequences. Behind the language stand how much
-past or future tells a state, and the worlds on which the paper's claims are computed: three with variants, and seven
-very small ones.
+Probabilities are fractions; `law` computes exact joint distributions of sequences. This module also computes how much
+past or future determines a state, and defines the worlds on which the paper's claims are checked: three with variants,
+and seven very small ones.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Distribution = dict[Any, Fraction]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A checked finite world; build it with `finite_world`. Two worlds are equal if they are the same object."""
+    """A validated finite world; build it with `finite_world`. Worlds compare by identity."""
 
     name: str
     states: tuple[AgentState, ...]
     exogenous: tuple[Exogenous, ...]
     actions: tuple[Action, ...]
     initial: dict[JointState, Fraction]
-    """Law of the pair at row 0 of a sequence."""
+    """Distribution of the pair at row 0."""
     step: dict[tuple[AgentState, Action], AgentState]
     drift: dict[Exogenous, Distribution]
     emission: dict[JointState, Distribution]
@@ -61,11 +61,11 @@ class World:
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
-        """Every observation that can be emitted, in a fixed order."""
+        """All observations that can be emitted, in a fixed order."""
         return tuple(dict.fromkeys(o for row in self.emission.values() for o in row))
 
     def reachable(self) -> set[JointState]:
-        """Pairs that some sequence visits."""
+        """Pairs (s, xi) that occur in some sequence."""
         found, todo = set(self.initial), list(self.initial)
         while todo:
             state, noise = todo.pop()
@@ -86,18 +86,18 @@ def finite_world(
     policy: Callable[[Any, Any], Mapping[Action, Any]] | None = None,
     initial: Mapping[JointState, Any] | None = None,
 ) -> World:
-    """Tabulate and check a world; raises UserError if it is not a world as the module describes.
+    """Tabulate and validate a world (see the module); UserError if it is invalid.
 
     Args:
-        name: how messages and tables call it.
+        name: name for messages and tables.
         states: agent-centric states.
         exogenous: exogenous states.
         actions: actions.
         step: next agent-centric state of (s, a).
-        drift: law of the next exogenous state.
-        emit: law of the observation of (s, xi).
-        policy: law of the action at (s, xi), which must not depend on xi; uniform by default.
-        initial: law of the first pair; uniform by default.
+        drift: distribution of the next exogenous state.
+        emit: distribution of the observation of (s, xi).
+        policy: distribution of the action at (s, xi), which must not depend on xi; uniform by default.
+        initial: distribution of the first pair; uniform by default.
     """
     states, exogenous, actions = tuple(states), tuple(exogenous), tuple(actions)
     if not (states and exogenous and actions):
@@ -125,13 +125,13 @@ def finite_world(
 
 
 def uniform(items: Iterable[Any]) -> Distribution:
-    """The uniform law on some items."""
+    """The uniform distribution over some items."""
     items = tuple(items)
     return {item: Fraction(1, len(items)) for item in items}
 
 
 def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] | None = None) -> Distribution:
-    """A row of probabilities as fractions, without zeros."""
+    """A distribution as fractions, without zeros."""
     law: Distribution = {}
     for key, value in row.items():
         try:
@@ -152,7 +152,7 @@ def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] |
 
 
 def distances(world: World, start: AgentState) -> dict[AgentState, int]:
-    """Fewest actions from a state to every state that can be reached from it."""
+    """Shortest path lengths from a state to all reachable states."""
     found, level = {start: 0}, [start]
     while level:
         depth = found[level[0]] + 1
@@ -163,7 +163,7 @@ def distances(world: World, start: AgentState) -> dict[AgentState, int]:
 
 
 def diameter(world: World) -> int | None:
-    """Longest shortest path between two states; None if some state cannot be reached from another."""
+    """Longest shortest path between two states; None unless every state can be reached from every other."""
     tables = [distances(world, s) for s in world.states]
     if any(len(table) < len(world.states) for table in tables):
         return None
@@ -171,28 +171,29 @@ def diameter(world: World) -> int | None:
 
 
 def period(world: World) -> int:
-    """Greatest common divisor of the lengths of all cycles through the first state: 1 if it is aperiodic."""
+    """Greatest common divisor of the lengths of all cycles through the first state; 1 if the world is aperiodic."""
     depth = distances(world, world.states[0])
     back = [depth[s] + 1 - depth[world.step[s, a]] for s in depth for a in world.actions]
     return gcd(*back)
 
 
 Couple = tuple[JointState, JointState]
-"""Two pairs (s, xi) that what is seen does not tell apart. Each further row can only remove couples, and once a row
-removes none, no later one does: so the search for a memory needs no bound, and None is proven."""
+"""Two pairs (s, xi) with the same observations so far. More rows can only remove couples, and once a row removes none,
+no later one does. So the search for a memory length terminates without a bound, and None is proven.
+"""
 
 
 def past_memory(world: World, actions: bool) -> int | None:
-    """Smallest m at which o_{t-m}..o_t (with a_{t-m}..a_{t-1}) always tells s_t; None if no m does."""
+    """Smallest m such that o_{t-m}..o_t (with a_{t-m}..a_{t-1}) determines s_t; None if there is none."""
     alike = _alike(world)
     return _rows_needed(alike, alike, lambda left: {after for c in left for after in _next(world, c, actions)} & alike)
 
 
 def future_memory(world: World, actions: bool, literal: bool = False) -> int | None:
-    """Smallest n at which the future from row t on always tells s_t; None if no n does.
+    """Smallest n such that the future from row t on determines s_t; None if there is none.
 
-    The future is o_t..o_{t+n}, with actions a_t..a_{t+n}; read literally, each row carries the action before it:
-    a_{t-1}..a_{t+n-1}, at every t that has an action before it.
+    The future is o_t..o_{t+n}, with actions a_t..a_{t+n}; read literally, each row contains the action before it:
+    a_{t-1}..a_{t+n-1}, for every t that has one.
     """
     couples = _alike(world)
     if literal:
@@ -208,7 +209,7 @@ def future_memory(world: World, actions: bool, literal: bool = False) -> int | N
 def _rows_needed(
     couples: set[Couple], judged: set[Couple], with_one_more: Callable[[set[Couple]], set[Couple]]
 ) -> int | None:
-    """How many further rows leave no couple of two states among those judged."""
+    """Number of further rows until no couple among those judged has two different states."""
     rows = 0
     while any(one != other for (one, _), (other, _) in couples & judged):
         fewer = with_one_more(couples)
@@ -219,13 +220,13 @@ def _rows_needed(
 
 
 def _alike(world: World) -> set[Couple]:
-    """Reachable couples that can show the same symbol."""
+    """Couples of reachable pairs that can emit the same symbol."""
     pairs = world.reachable()
     return {(one, other) for one in pairs for other in pairs if world.emission[one].keys() & world.emission[other]}
 
 
 def _next(world: World, couple: Couple, actions: bool) -> Iterator[Couple]:
-    """Couples that may follow a couple: after the same action where actions are seen."""
+    """Successors of a couple; if actions are observed, under equal actions."""
     (one, here), (other, there) = couple
     for a, b in product(world.policy[one], world.policy[other]):
         if a == b or not actions:
@@ -234,19 +235,19 @@ def _next(world: World, couple: Couple, actions: bool) -> Iterator[Couple]:
 
 
 BLANK = "blank"
-"""Observation that shows nothing."""
+"""Uninformative observation."""
 HALF = Fraction(1, 2)
 
 
 def counterexample(actions: tuple[int, int] = (-1, 1), every: int = 4) -> World:
-    """The paper's own, against forward jumps (section 3.2 and appendix).
+    """The paper's counterexample to forward jumps (section 3.2 and appendix).
 
-    s = (s^A, s^B): s^A in Z_4 moves by the action, s^B is the last action. A counter c runs by itself and the state
-    is shown when c = 0 alone.
+    s = (s^A, s^B): s^A in Z_4 moves by the action, s^B is the last action. The exogenous state is a counter c, and the
+    state is observed only when c = 0.
 
     Args:
         actions: (-1, 1) as in the appendix, or (0, 1) as in the main text.
-        every: the counter's period: the state is shown every so many rows.
+        every: period of the counter.
     """
     return finite_world(
         "counterexample",
@@ -260,10 +261,10 @@ def counterexample(actions: tuple[int, int] = (-1, 1), every: int = 4) -> World:
 
 
 def echo() -> World:
-    """A world that observations alone decode, before and after: an action moves by one at once, by two a step later.
+    """A world that past or future observations alone decode: an action moves by one now, and by two a step later.
 
-    s = (x, b): x in Z_4, b the last action in {0, 1}, x' = x + 2b + a, and o = x. Two observations in a row tell b and
-    a, whether they are the last two (m = 1) or the next two (n = 1).
+    s = (x, b): x in Z_4, b the last action in {0, 1}, x' = x + 2b + a, and o = x. Two consecutive observations
+    determine b and a, both the last two (m = 1) and the next two (n = 1).
     """
     return finite_world(
         "echo",
@@ -277,7 +278,7 @@ def echo() -> World:
 
 
 def momentum() -> World:
-    """A position that is shown and a velocity that is not: the future decodes it only if actions are known.
+    """Observed position and hidden velocity: the future decodes the velocity only with actions.
 
     s = (x, v): x and v in Z_3; an action a in {0, 1} changes v' = v + a, then x' = x + v', and o = x. From the past,
     v = x_t - x_{t-1} (m = 1); from the future, v = x_{t+1} - x_t - a_t (n = 1, with actions).
@@ -294,15 +295,15 @@ def momentum() -> World:
 
 
 TINY: dict[str, list[tuple[int, int, Symbol]]] = {
-    "idle": [(0, 0, BLANK)],  # actions do nothing, and nothing is seen
-    "switch": [(0, 1, 0), (0, 1, 1)],  # the state is the last action, and is shown
-    "hidden switch": [(0, 1, BLANK), (0, 1, BLANK)],  # the state is the last action; nothing is seen
-    "toggle": [(0, 1, 0), (1, 0, 1)],  # action 1 changes sides, action 0 stays; the side is shown
-    "alternator": [(1, 1, 0), (0, 0, 1)],  # both actions change sides; the side is shown
-    # action 1 climbs a step, action 0 falls to the ground, and from the top one falls; only the ground is shown
+    "idle": [(0, 0, BLANK)],  # actions have no effect; observations are blank
+    "switch": [(0, 1, 0), (0, 1, 1)],  # the state is the last action, and is observed
+    "hidden switch": [(0, 1, BLANK), (0, 1, BLANK)],  # the state is the last action; observations are blank
+    "toggle": [(0, 1, 0), (1, 0, 1)],  # action 1 switches sides, action 0 stays; the side is observed
+    "alternator": [(1, 1, 0), (0, 0, 1)],  # both actions switch sides; the side is observed
+    # action 1 climbs one step, action 0 and the top step lead to the ground; only the ground is observed
     "ladder": [(0, 1, "ground"), (0, 2, BLANK), (0, 0, BLANK)],
 }
-"""Worlds without an exogenous part: for each state the ones after actions 0 and 1, and what it shows."""
+"""Worlds without exogenous states: for each state the next ones after actions 0 and 1, and its observation."""
 
 
 def tiny(name: str) -> World:
@@ -320,7 +321,7 @@ def tiny(name: str) -> World:
 
 
 def flicker() -> World:
-    """The state is the last action; it is shown in every second row, when a light is on."""
+    """The state is the last action, observed in every second row, when a light is on."""
     return finite_world(
         "flicker",
         states=[0, 1],
@@ -336,7 +337,7 @@ WORLDS = {"counterexample": counterexample, "echo": echo, "momentum": momentum}
 
 
 def noisy(world: World) -> World:
-    """The world with a lamp, shown beside every observation, that goes on at a random time."""
+    """The world with a lamp, appended to every observation, that turns on at a random time."""
     lamp: dict[Exogenous, Distribution] = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
     return replace(
         world,
@@ -355,7 +356,7 @@ def noisy(world: World) -> World:
 
 
 def biased(world: World) -> World:
-    """The world under a policy that depends on the state: state i takes action i (mod their number) more often."""
+    """The world with a state-dependent policy: state i takes action i (mod their number) more often."""
     count = len(world.actions)
     policy = {
         s: {a: Fraction(1 + (j == i % count), count + 1) for j, a in enumerate(world.actions)}
