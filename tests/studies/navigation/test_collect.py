@@ -125,11 +125,6 @@ def test_wrong_settings_are_named(changes, message, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
-def test_another_collection_is_refused(maze_set):
-    with pytest.raises(UserError, match="collected with another seed"):
-        collect(small(maze_set, seed=2))
-
-
 def test_first_person_data_holds_headings_and_moves(tmp_path):
     collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
     dataset = open_dataset(tmp_path / "set", tmp_path / "cache")

@@ -116,14 +116,6 @@ def test_a_supervised_reference_learns_from_the_states_alone(maze_set, tmp_path)
     assert not trainer_of(smoke(maze_set, tmp_path / "run", method="supervised"))[1].encoder.config.use_actions
 
 
-def test_frames_of_a_window_are_encoded_once(maze_set, tmp_path):
-    trainer, probed = trainer_of(smoke(maze_set, tmp_path / "run"))
-    calls = []
-    probed.encoder.frame.register_forward_hook(lambda m, i, o: calls.append(i[0].shape))
-    trainer.update()
-    assert calls == [(4, 16, 1, 50, 50)]
-
-
 def test_held_out_trajectories_are_never_trained_on(maze_set, tmp_path):
     data = trainer_of(smoke(maze_set, tmp_path / "run"))[1].data
     assert data.first_held_out == 11

@@ -38,7 +38,7 @@ class Planner:
 
     def __init__(self, env: MazeEnv) -> None:
         self._maze = env.maze
-        self._next = {}
+        self._next: dict[tuple[int, int], dict[tuple[int, int], tuple[int, int]]] = {}
         """By goal cell: the next cell on the shortest path from every cell, by breadth-first search from the goal."""
         for goal in FREE_CELLS:
             following, queue = {goal: goal}, deque([goal])

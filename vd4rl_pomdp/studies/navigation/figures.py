@@ -112,7 +112,7 @@ def trajectories(runs: list[NavigationRun], path: Path) -> bool:
             if (condition := Condition(maze, method)) not in found:
                 axes.text(0.5, 0.5, f"{maze}: {method}\nno run", ha="center", va="center", transform=axes.transAxes)
                 continue
-            axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), *[2 * HALF_SIZE] * 2, color="#e4c9a8", zorder=0))
+            axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), 2 * HALF_SIZE, 2 * HALF_SIZE, color="#e4c9a8", zorder=0))
             for i, j in FREE_CELLS:
                 axes.add_patch(Rectangle((j - HALF_SIZE, HALF_SIZE - i - 1), 1, 1, color="#f7f7f7", zorder=0))
             for (x, y), (half_x, half_y) in ((curtain.center, curtain.half) for curtain in MAZES[maze].curtains):

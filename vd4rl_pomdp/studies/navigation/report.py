@@ -296,7 +296,8 @@ def judge(claim: Claim, numbers: Numbers) -> Verdict:
     holding = sum(claim.holds(left[seed], right[seed]) for seed in seeds)
     means = [sum(side[seed] for seed in seeds) / len(seeds) if seeds else math.nan for side in (left, right)]
     paper = paper_number(*claim.left), paper_number(*claim.right) if claim.right else 1.0
-    return Verdict(claim, *means, len(seeds), holding, None if None in paper else paper)
+    known = None if paper[0] is None or paper[1] is None else (paper[0], paper[1])
+    return Verdict(claim, means[0], means[1], len(seeds), holding, known)
 
 
 def verdict_lines(frame: pd.DataFrame) -> list[str]:
@@ -348,13 +349,15 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
 
 Samples = Callable[[], Mapping[str, np.ndarray]]
 """Renders sample observations: (n, 3, H, W) uint8 by name."""
-_CAPTIONS = (
-    ("accuracy.png", "Accuracy of every objective", "Bars: held-out trajectories, probe refitted on frozen states."),
-    ("accuracy_raw.png", "The same in raw units", "The paper's marks are training averages."),
-    ("trajectories.png", "True and estimated trajectories",
-     "From the first row on, where little was seen: errors count later ones."),
-    ("observations.png", "Sample observations", "What a model is shown along a drive through each maze."),
-)  # fmt: skip
+_CAPTIONS = {
+    "accuracy.png": ("Accuracy of every objective", "Bars: held-out trajectories, probe refitted on frozen states."),
+    "accuracy_raw.png": ("The same in raw units", "The paper's marks are training averages."),
+    "trajectories.png": (
+        "True and estimated trajectories",
+        "From the first row on, where little was seen: errors count later ones.",
+    ),
+    "observations.png": ("Sample observations", "What a model is shown along a drive through each maze."),
+}
 _HARD = """\
 `hard_` mazes are variants of the paper's. Three wider curtains hide the mass 36% of the time (its own:
 some 22%), every action is noisy (not a tenth of them zero and a tenth random), and the first person has
@@ -392,29 +395,23 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     drawn = samples() if samples is not None else None  # before anything is written, since OpenGL may be missing
     with owned(out):
         save_runs(runs, out)
-        frame, figured = frame_of(runs), out / "figures"
-        figured.mkdir(exist_ok=True)
-        state, pictures = refitted_error("state"), []
-        for (name, title, caption), shown in zip(
-            _CAPTIONS,
-            (
-                figures.accuracy_bars(frame, state, figured / "accuracy.png"),
-                figures.accuracy_bars(frame, state.raw(), figured / "accuracy_raw.png"),
-                figures.trajectories(runs, figured / "trajectories.png"),
-                drawn and figures.observations(drawn, figured / "observations.png"),
-            ),
-            strict=True,
-        ):
-            pictures += [f"![{title}](figures/{name})", "", caption, ""] if shown else []
+        frame, state, folder = frame_of(runs), refitted_error("state"), out / "figures"
+        folder.mkdir(exist_ok=True)
+        shown = {
+            "accuracy.png": figures.accuracy_bars(frame, state, folder / "accuracy.png"),
+            "accuracy_raw.png": figures.accuracy_bars(frame, state.raw(), folder / "accuracy_raw.png"),
+            "trajectories.png": figures.trajectories(runs, folder / "trajectories.png"),
+            "observations.png": drawn and figures.observations(drawn, folder / "observations.png"),
+        }
         cells = make_tables(frame)
         write_tables(cells, out / "tables.csv")
-        lines = [*_head(runs, unfinished), *verdict_lines(frame), *pictures, *table_sections(cells), _COMMANDS]
-        told = [
-            (run.result.files["results"]["command"], run.condition.maze, run.result.files["timing"]) for run in runs
-        ]
-        lines += code_block(
-            [f"{words}  # {maze}, {float(cost['seconds']):.0f} s" for words, maze, cost in told], "bash"
-        )
+        lines = [*_head(runs, unfinished), *verdict_lines(frame)]
+        for name in filter(shown.get, shown):
+            lines += [f"![{_CAPTIONS[name][0]}](figures/{name})", "", _CAPTIONS[name][1], ""]
+        lines += [*table_sections(cells), _COMMANDS]
+        commands = [(run, run.result.files["results"]["command"], run.result.files["timing"]) for run in runs]
+        told = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
+        lines += code_block(told, "bash")
         write_text(out / "report.md", "\n".join(lines) + "\n")
     return out / "report.md"
 

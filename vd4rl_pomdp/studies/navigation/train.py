@@ -92,7 +92,7 @@ class ErrorSums(nn.Module):
         self.counts.zero_()
 
     def both(self, std: Tensor) -> dict[str, float]:
-        """`state`, `position`, `velocity` in percent of `std` (4,); with suffix `_hidden` if any counted row was hidden;
+        """`state`, `position`, `velocity` in percent of `std` (4,); with suffix `_hidden` if a counted row was hidden;
         and all of them with RAW_PREFIX in the simulator's units x 100."""
         sums, counts = self.sums.cpu(), self.counts.cpu()
         return {

@@ -245,9 +245,10 @@ DIAGRAMS = (("fj", 3), ("fj+a", 3), ("fj+a", 5), ("mik+a", 3), ("mik+a literal",
 
 def theory_study() -> dict[str, Any]:
     """Compute counterexample, Table 1, equations, facts and merged states, JSON-serialisable."""
-    worlds, rows, needs = zip(*(_of_world(name, make()) for name, make in WORLDS.items()), strict=True)
-    described = dict(zip(WORLDS, worlds, strict=True))
-    rows, needs = [row for some in rows for row in some], [row for some in needs for row in some]
+    results = {name: _of_world(name, make()) for name, make in WORLDS.items()}
+    described = {name: told for name, (told, _, _) in results.items()}
+    rows = [row for _, found, _ in results.values() for row in found]
+    needs = [row for _, _, found in results.values() for row in found]
     tables = {name: [method_row(name, method, rows, needs) for method in METHODS] for name in WORLDS}
     equations = compare_equations(rows, {name: row["m"] for name, row in described.items()})
     world = counterexample()
