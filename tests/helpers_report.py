@@ -27,13 +27,8 @@ def write_run(
 ) -> Path:
     """A fine-tuning run with the given scores of its episodes by step."""
     folder.mkdir(parents=True)
-    record = {
-        "stage": "finetune",
-        "config": {"seed": seed},
-        "versions": {},
-        "git_commit": "abc",
-        "command": "vd4rl-pomdp",
-    }
+    record = {"stage": "finetune", "config": {"seed": seed}, "versions": {}, "git_commit": "abc"}
+    record["command"] = "vd4rl-pomdp"
     (folder / "config.json").write_text(json.dumps(record))
     (folder / "metrics.jsonl").write_text('{"step": 10, "bc_loss": 0.5}\n')
     names = {"method": method, "task": "walker_walk", "quality": "expert", "corruption": "patch"}
@@ -49,9 +44,8 @@ def write_run(
     (folder / "timing.json").write_text('{"seconds": 3.0}')
     if film:
         pictures = np.random.default_rng(0).integers(0, 256, (4, 12, 84, 84), dtype=np.uint8)
-        np.savez(
-            folder / "film.npz", **{"clean": pictures[:, :3], "corrupted": pictures[:, 3:], "return": np.arange(4.0)}
-        )
+        arrays = {"clean": pictures[:, :3], "corrupted": pictures[:, 3:], "return": np.arange(4.0)}
+        np.savez(folder / "film.npz", **arrays)
     return folder
 
 
@@ -85,14 +79,8 @@ def write_seeds(
 ) -> Path:
     """Runs that end with the given scores, by method and corruption a seed each, beside data of a mean return.
 
-    Args:
-        folder: where to.
-        scores: by method and corruption.
-        data_return: of the data that they learned from.
-        algorithm: that fine-tuned them.
-        moved: share of its value by which each critic moved at the end; None: runs that did not record it.
-        of_set: task and quality, if it is not the expert walker's.
-        settings: of their encoders.
+    `moved` is the share of its value by which each critic moved at the end (None: not recorded), `of_set` task and
+    quality, if it is not the expert walker's, `settings` are those of encoders.
     """
     for (method, corruption), seeds in scores.items():
         for seed, score in enumerate(seeds):

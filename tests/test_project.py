@@ -207,13 +207,15 @@ def test_the_changelog_tells_of_the_present_version():
     assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE).group(1) == version
 
 
-def test_a_wheel_holds_every_file_of_the_packages(tmp_path):
+def test_a_wheel_holds_every_file_of_the_packages_and_two_agents(tmp_path):
     for name in (*PACKAGES, "pyproject.toml", "setup.py", "README.md", "LICENSE"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)
     with ZipFile(build_wheel(tmp_path)) as wheel:
         packed = {name for name in wheel.namelist() if ".dist-info/" not in name}
-    assert packed == {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in _files(ROOT / package)}
+    there = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in _files(ROOT / package)}
+    assert packed == {name for name in there if not re.match(r"vd4rl_pomdp/agents/.*/random/", name)}
+    assert sum(name.endswith("/card.json") for name in packed) == 2
 
 
 def _files(folder: Path) -> list[Path]:

@@ -24,7 +24,7 @@ from vd4rl_pomdp.core.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, play
 from vd4rl_pomdp.data.folder import PROVENANCE
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import Row, groups, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 
 CORES = 2
@@ -93,10 +93,9 @@ def rows_of(path: Path) -> list[Row]:
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
     """The table, from raw rows."""
     seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
-    table = []
+    table, by_set = [], groups(returns, lambda row: (row["task"], row["quality"]))
     for task, quality in product(dict.fromkeys(row["task"] for row in returns), SET_QUALITIES):
-        mine = [float(r["return"]) for r in returns if (r["task"], r["quality"]) == (task, quality)]
-        if mine:
+        if mine := [float(row["return"]) for row in by_set.get((task, quality), ())]:
             row = {"task": task, "quality": quality, "episodes": len(mine), "seconds_100k": round(seconds[task])}
             statistics = {"mean": np.mean(mine), "min": min(mine), "max": max(mine)}
             table.append(row | {name: f"{value:.1f}" for name, value in statistics.items()})

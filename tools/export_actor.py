@@ -31,7 +31,6 @@ from vd4rl_pomdp.runs.files import write_bytes
 CARD_EPISODES = 20
 CARD_SEED = 10_000
 """Episode i of an actor's card has environment seed CARD_SEED + i."""
-CURVE_COLUMNS = ("decisions", "return_mean")
 SETTINGS, CURVE, NETWORKS = "config.json", "curve.csv", "networks.safetensors"
 PROGRESS = (SETTINGS, CURVE, NETWORKS)
 """Files of a run from which another one can start."""
@@ -117,51 +116,24 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
     for file in PROGRESS:
         if (run / file).exists() and out.resolve() != run.resolve():
             shutil.copy(run / file, out / file)
-    files = {}
-    for quality, step in (("expert", expert), ("medium", medium)):
-        files[quality] = out / f"{name}_{quality}.safetensors"
-        _publish(files[quality], read_actor(snapshot_path(run, step)), config, quality, step, judged[step], curve)
-    files["replay"] = out / f"{name}_replay.safetensors"
-    _ladder(run, name, [row for row in kept if row[0] <= medium]).save(files["replay"])
-    return files
-
-
-def _publish(
-    path: Path,
-    actor: Actor,
-    config: dict[str, Any],
-    quality: str,
-    step: int,
-    returns: list[float],
-    curve: list[tuple[int, float]],
-) -> None:
-    """Write an actor with its card, and the card with the learning curve as a separate file.
-
-    Training versions come from the snapshot, evaluation versions from this process.
-    """
+    files = {quality: out / f"{name}_{quality}.safetensors" for quality in ("expert", "medium", "replay")}
+    # versions of what trained it come from the snapshot, of what evaluated it from this process
     here = {name: version(name) for name in ("dm-control", "mujoco", "numpy")}
-    card = {
-        "task": config["task"],
-        "quality": quality,
-        "decisions": step,
-        "return_mean": round(float(np.mean(returns)), 3),
-        "return_min": round(min(returns), 3),
-        "return_max": round(max(returns), 3),
-        "returns": returns,
-        "returns_seeds": [CARD_SEED, CARD_SEED + CARD_EPISODES - 1],
-        "config": config,
-        "versions": actor.card.get("versions", {}) | here,
-    }
-    Actor(actor.weights, card).save(path)
-    write_bytes(path.with_suffix(".json"), (json.dumps(card | {"learning_curve": curve}, indent=1) + "\n").encode())
-
-
-def _ladder(run: Path, task: str, rows: list[tuple[int, float]]) -> Ladder:
-    """At most LADDER_RUNGS snapshots, evenly spaced up to the last of `rows`."""
+    for quality, step in (("expert", expert), ("medium", medium)):
+        actor, returns, path = read_actor(snapshot_path(run, step)), judged[step], files[quality]
+        card = {"task": name, "quality": quality, "decisions": step, "return_mean": round(float(np.mean(returns)), 3)}
+        card |= {"return_min": round(min(returns), 3), "return_max": round(max(returns), 3), "returns": returns}
+        card |= {"returns_seeds": [CARD_SEED, CARD_SEED + CARD_EPISODES - 1], "config": config}
+        card["versions"] = actor.card.get("versions", {}) | here
+        Actor(actor.weights, card).save(path)
+        told = json.dumps(card | {"learning_curve": curve}, indent=1)
+        write_bytes(path.with_suffix(".json"), f"{told}\n".encode())
+    rows = [row for row in kept if row[0] <= medium]
     chosen = sorted({round(i) for i in np.linspace(0, len(rows) - 1, min(LADDER_RUNGS, len(rows)))})
     steps = [rows[i][0] for i in chosen]
-    actors = [read_actor(snapshot_path(run, step)) for step in steps]
-    return Ladder.of(actors, {"task": task, "decisions": steps, "curve": [rows[i][1] for i in chosen]})
+    of = {"task": name, "decisions": steps, "curve": [rows[i][1] for i in chosen]}
+    Ladder.of([read_actor(snapshot_path(run, step)) for step in steps], of).save(files["replay"])
+    return files
 
 
 def exported_actors(folder: Path, task: str) -> Iterator[tuple[int, Actor]]:

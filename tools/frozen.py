@@ -79,43 +79,25 @@ def call(*words: object) -> None:
     main([str(word) for word in words])
 
 
-def losses(run: Path) -> list[object]:
-    """Metrics rows: step, names and exact values."""
-    return [sorted(json.loads(line).items()) for line in (run / "metrics.jsonl").read_text().splitlines()]
-
-
-def weights(run: Path) -> list[object]:
-    """Every tensor of a run's encoder and policy."""
-    found: list[object] = []
-    for part in ("encoder", "policy"):
-        for path in sorted((run / part).glob("*.safetensors")):
-            tensors = load_file(path)
-            found += [[part, n, str(t.dtype), t.shape, hashlib.sha256(t.tobytes()).hexdigest()] for n, t in sorted(tensors.items())]  # fmt: skip # noqa: E501
-    return found
-
-
-def episodes(run: Path) -> list[object]:
-    """Episodes: step, seed, corruption, return and length."""
-    if not (run / "episodes.csv").exists():
-        return []
-    with (run / "episodes.csv").open(newline="") as file:
-        return [[row[n] for n in ("step", "episode_seed", "evaluated_under", "return", "length")] for row in csv.DictReader(file)]  # fmt: skip # noqa: E501
-
-
-def probes(run: Path) -> list[object]:
-    """Probe errors, and all numbers of a navigation run."""
-    found: list[object] = []
-    if (run / "probe.json").exists():
-        found += sorted(json.loads((run / "probe.json").read_text()).items())
-    if (run / "results.json").exists():
-        rows = json.loads((run / "results.json").read_text())["rows"]
-        found += [[row[name] for name in ("measure", "split", "probe", "rows", "k", "value")] for row in rows]
-    return found
-
-
 def fingerprint(run: Path) -> dict[str, str]:
     """Short hashes of a run's results."""
-    parts = {"losses": losses(run), "weights": weights(run), "probes": probes(run), "episodes": episodes(run)}
+    parts: dict[str, list[object]] = {"losses": [], "weights": [], "probes": [], "episodes": []}
+    parts["losses"] = [sorted(json.loads(line).items()) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    for part in ("encoder", "policy"):
+        for path in sorted((run / part).glob("*.safetensors")):
+            for name, tensor in sorted(load_file(path).items()):
+                bits = hashlib.sha256(tensor.tobytes()).hexdigest()
+                parts["weights"].append([part, name, str(tensor.dtype), tensor.shape, bits])
+    if (run / "probe.json").exists():
+        parts["probes"] += sorted(json.loads((run / "probe.json").read_text()).items())
+    if (run / "results.json").exists():  # of navigation
+        names = ("measure", "split", "probe", "rows", "k", "value")
+        rows = json.loads((run / "results.json").read_text())["rows"]
+        parts["probes"] += [[row[name] for name in names] for row in rows]
+    if (run / "episodes.csv").exists():
+        names = ("step", "episode_seed", "evaluated_under", "return", "length")
+        with (run / "episodes.csv").open(newline="") as file:
+            parts["episodes"] = [[row[name] for name in names] for row in csv.DictReader(file)]
     return {name: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16] for name, value in parts.items() if value}
 
 
@@ -140,8 +122,8 @@ def runs(work: Path) -> dict[str, dict[str, str]]:
         call("pretrain", *common, *words, "--out", out)
         found[f"pretrain {name}"] = fingerprint(out)
     for name, (encoder, words) in FINETUNED.items():
-        out = work / "runs/finetune" / name
-        call("finetune", *common, "--encoder", work / "runs/pretrain" / encoder / "encoder", *words, "--workers", 1, "--out", out)  # fmt: skip # noqa: E501
+        out, folder = work / "runs/finetune" / name, work / "runs/pretrain" / encoder / "encoder"
+        call("finetune", *common, "--encoder", folder, *words, "--workers", 1, "--out", out)
         found[f"finetune {name}"] = fingerprint(out)
     for method in MAZES:
         out = work / "runs/maze" / method
@@ -160,6 +142,7 @@ if __name__ == "__main__":
     if args.write:
         FROZEN.write_text(json.dumps(now, indent=1) + "\n")
     then = json.loads(FROZEN.read_text())
-    other = [f"{run}: {part}" for run in {**then, **now} for part in {**then.get(run, {}), **now.get(run, {})} if then.get(run, {}).get(part) != now.get(run, {}).get(part)]  # fmt: skip # noqa: E501
+    both = {run: (then.get(run, {}), now.get(run, {})) for run in {**then, **now}}
+    other = [f"{run}: {part}" for run, (a, b) in both.items() for part in {**a, **b} if a.get(part) != b.get(part)]
     print("\n".join(other) or f"all {len(now)} runs as frozen")
     sys.exit(bool(other))

@@ -20,7 +20,7 @@ from pathlib import Path
 
 RESULTS = Path(__file__).parent.parent / "results" / "ladder"
 CURVES = ("q", "critic_loss", "actor_loss", "bc_loss")
-_PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
+PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
 def keep_policies(runs: Path, snapshots: Path) -> None:
@@ -41,7 +41,7 @@ def keep_policies(runs: Path, snapshots: Path) -> None:
 
 def keep_rows(runs: Path) -> int:
     """Add finished runs to results/ladder, and their losses and critic values to its curves.csv."""
-    code = subprocess.run([_PROGRAM, "results", "add", str(runs), "--out", str(RESULTS)]).returncode
+    code = subprocess.run([PROGRAM, "results", "add", str(runs), "--out", str(RESULTS)]).returncode
     with (RESULTS / "curves.csv").open("w", newline="") as file:
         table = csv.DictWriter(file, ["run", "step", *CURVES], lineterminator="\n")
         table.writeheader()
@@ -67,7 +67,7 @@ def main() -> int:
     args = parser.parse_args()
     if args.rows:
         return keep_rows(args.work / "runs")
-    command = [_PROGRAM, "sweep", "run", str(RESULTS / "grid.toml")]
+    command = [PROGRAM, "sweep", "run", str(RESULTS / "grid.toml")]
     command += ["--out", str(args.work / "runs"), "--data", str(args.work / "data"), "--jobs", args.jobs]
     command += ["--done", str(RESULTS)] if (RESULTS / "runs.jsonl").exists() else []
     command += ["--only", *args.only] if args.only else []

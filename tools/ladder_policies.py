@@ -24,6 +24,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
+from ladder import PROGRAM, RESULTS
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from script import run_script
@@ -39,12 +40,10 @@ from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs import CONFIG_FILE, LABELS_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import read_json, write_csv
 
-RESULTS = Path(__file__).parents[1] / "results" / "ladder"
 SEED = 10_000
 """Collection seed of the held-out episodes, used by no training set."""
 EPISODES = 20
 """Held-out episodes, and as many evenly spaced episodes of a run's own dataset."""
-_PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ def averages(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path
             with safe_open(files[-1], "pt") as file:
                 save_file(mean, scratch / "policy" / "model.safetensors", metadata=file.metadata())
             under = ["--corruption", labels["corruption"], "--episodes", str(config["eval_episodes"])]
-            words = [_PROGRAM, "evaluate", str(scratch), *under, "--workers", "1", "--json"]
+            words = [PROGRAM, "evaluate", str(scratch), *under, "--workers", "1", "--json"]
             told = json.loads(subprocess.run(words, stdout=subprocess.PIPE, check=True).stdout)
             for each in told["under"][labels["corruption"]]["episodes"]:
                 found.append((step, len(files), each["episode"], round(each["return"], 4)))

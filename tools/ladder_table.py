@@ -7,23 +7,23 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from script import run_script
+from script import run_script, table
 
 from vd4rl_pomdp.core.tasks import TASKS
-from vd4rl_pomdp.report.figures import Draw, looks_of, sheet, style
+from vd4rl_pomdp.report.figures import looks_of, sheet, style
 from vd4rl_pomdp.report.stats import mean_and_error, number
 from vd4rl_pomdp.runs.critic import CONVERGED, VALUE, critic_of
-from vd4rl_pomdp.runs.results import Result, read_results
+from vd4rl_pomdp.runs.files import Row, groups
+from vd4rl_pomdp.runs.results import read_results
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
@@ -39,6 +39,8 @@ FILES = {
 """By file, its columns and the attributes of `Cell` that hold them."""
 LOOKS = looks_of(())
 """Plot style by method."""
+BASE = (256, "bf16", 3000, 100, 4)
+"""Units, precision, pretraining steps, episodes of the dataset and views of the first rungs."""
 LEVERS = {
     "": "-",
     "1,024 units": "--",
@@ -48,7 +50,6 @@ LEVERS = {
     "16 views": (0, (1, 1)),
 }
 """Line dashes by the setting that differs from the base."""
-Look = dict[str, Any]
 
 
 class Key(NamedTuple):
@@ -73,15 +74,15 @@ class Key(NamedTuple):
 
     @property
     def lever(self) -> str:
-        """Settings that differ from the base: 256 units, bf16, 3,000 steps, 100 episodes, 4 views."""
-        levers = (
-            (f"{self.units:,} units", self.units != 256),
-            (self.precision, self.precision != "bf16"),
-            (f"{self.steps:,} steps", self.steps != 3000),
-            (f"{self.episodes} episodes", self.episodes != 100),
-            (f"{self.views} views", self.views != 4),
-        )
-        return ", ".join(words for words, other in levers if other)
+        """Settings that differ from the base, in words."""
+        words = ("{:,} units", "{}", "{:,} steps", "{} episodes", "{} views")
+        told = zip(words, self[4:], BASE, strict=True)
+        return ", ".join(word.format(value) for word, value, base in told if value != base)
+
+    @property
+    def called(self) -> str:
+        """Method and settings that differ from the base."""
+        return ", ".join(filter(None, (f"`{self.method}`", self.lever)))
 
     @property
     def counts(self) -> bool:
@@ -151,53 +152,40 @@ def cells_in(folder: Path = RESULTS) -> list[Cell]:
     cells = {}
     for run in read_results(folder):
         if run.record["stage"] == "finetune" and run.finished:
-            name = next(name for name in known if run.record["config"]["out"].endswith(name))
-            cells[_key(run)] = _cell(run, known[name])
+            config = run.record["config"]
+            card = run.card | {"corruption": run.card["corruption"]["corruption"]}
+            name = next(name for name in known if config["out"].endswith(name))
+            trained = (row for row in run.rows if row["evaluated_under"] == row["corruption"])
+            by_rung = groups(trained, lambda row: row["step"])
+            returns = {rung: {row["episode_seed"]: row["return"] for row in rows} for rung, rows in by_rung.items()}
+            clean = [row["return"] for row in run.rows if row["evaluated_under"] == "none"]
+            key, clean = _key(run.record["collection"], card, config), clean[-len(returns[max(returns)]) :]
+            data, gamma = run.files["reference"]["data_return"], config["gamma"]
+            cells[key] = Cell(key, **known[name], returns=returns, clean=clean, data_return=data, gamma=gamma)
     return [cells[key] for key in asked() if key in cells]
 
 
-def _key(run: Result) -> Key:
-    config, card, made = run.record["config"], run.card, run.record["collection"]
-    place = made["task"], made["quality"], card["corruption"]["corruption"], card["method"]
-    own = config["hidden_dim"], config["update_precision"], card["steps"], made["episodes"], config["views"]
+def _key(made: Row, before: Row, after: Row) -> Key:
+    place = made["task"], made["quality"], before["corruption"], before["method"]
+    own = after["hidden_dim"], after["update_precision"], before["steps"], made["episodes"], after["views"]
     return Key(*place, *own)
-
-
-def _cell(run: Result, known: Mapping[str, dict[int, float]]) -> Cell:
-    returns: defaultdict[int, dict[int, float]] = defaultdict(dict)
-    for row in run.rows:
-        if row["evaluated_under"] == row["corruption"]:
-            returns[row["step"]][row["episode_seed"]] = row["return"]
-    clean = [row["return"] for row in run.rows if row["evaluated_under"] == "none"][-len(returns[max(returns)]) :]
-    data, gamma = run.files["reference"]["data_return"], run.record["config"]["gamma"]
-    return Cell(_key(run), **known, returns=dict(returns), clean=clean, data_return=data, gamma=gamma)
 
 
 def asked() -> list[Key]:
     """All cells of the ladder's grid, in order."""
-    keys = []
-    for cell in load_grid(str(RESULTS / "grid.toml")).cells():
-        made, before, after = collection_of(cell), recorded(cell, "pretrain"), recorded(cell, "finetune")
-        place = made["task"], made["quality"], before["corruption"], before["method"]
-        own = after["hidden_dim"], after["update_precision"], before["steps"], made["episodes"], after["views"]
-        keys.append(Key(*place, *own))
-    return keys
+    cells = load_grid(str(RESULTS / "grid.toml")).cells()
+    return [_key(collection_of(cell), recorded(cell, "pretrain"), recorded(cell, "finetune")) for cell in cells]
 
 
 def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
     """One row per run: where returns peak and end, and its diagnostics without evaluations."""
-    yield (
-        "| set (data's return) | policy | best rung: return (updates) | last rung: return (updates) | the same, played "
-        "clean | critic converged at (updates) | its value at the end; the data's own | held-out cloning loss: lowest "
-        "(updates), last | last on episodes of the set, on batches |"
-    )
-    yield "|---|---|---:|---:|---:|---:|---:|---:|---:|"
+    rows = []
     for cell in cells:
         best = max(cell.returns, key=lambda rung: np.mean(_of(cell, rung)))
         last, lowest = max(cell.returns), min(cell.held_out, key=cell.held_out.__getitem__)
         told = [
             f"{cell.key.setting} ({cell.data_return:.0f})",
-            _called(cell.key),
+            cell.key.called,
             *(f"{mean_and_error(_of(cell, rung))} ({rung:,})" for rung in (best, last)),
             mean_and_error(cell.clean) if cell.clean else number(None),
             _spans(cell),
@@ -205,19 +193,19 @@ def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
             f"{cell.held_out[lowest]:.4f} ({lowest:,}), {cell.held_out[last]:.4f}",
             f"{cell.trained_on[last]:.4f}, {cell.batches[last]:.4f}",
         ]
-        yield f"| {' | '.join(told)} |"
+        rows.append(told)
+    head = ["set (data's return)", "policy", "best rung: return (updates)", "last rung: return (updates)"]
+    head += ["the same, played clean", "critic converged at (updates)", "its value at the end; the data's own"]
+    head += ["held-out cloning loss: lowest (updates), last", "last on episodes of the set, on batches"]
+    return table(head, rows, (0, 1))
 
 
 def _of(cell: Cell, rung: int) -> list[float]:
     return list(cell.returns[rung].values())
 
 
-def _called(key: Key) -> str:
-    return ", ".join(filter(None, (f"`{key.method}`", key.lever)))
-
-
 def _spans(cell: Cell) -> str:
-    """Rungs at which the critic has converged, as ranges ("60,000 to 200,000"); a dash if there are none."""
+    """Rungs at which the critic has converged, with neighbors merged: "60,000 to 200,000"."""
     rungs, there = sorted(cell.held_out), set(cell.converged())
     spans: list[list[int]] = []
     for before, rung in zip([0, *rungs], rungs, strict=False):
@@ -227,85 +215,72 @@ def _spans(cell: Cell) -> str:
 
 
 def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """Return, critic value and cloning loss of every run by rung, and the difference of `mik+a` and `acro`."""
-    rungs = sorted({rung for cell in cells for rung in cell.returns})
-    yield f"| set | policy | | {' | '.join(f'{rung:,}' for rung in rungs)} |"
-    yield "|---|---|---|" + "---:|" * len(rungs)
+    """Return, critic value and cloning loss of each run by rung, and the difference of `mik+a` and `acro`."""
+    rungs, rows = sorted({rung for cell in cells for rung in cell.returns}), []
     by_key = {cell.key: cell for cell in cells}
-
-    def line(setting: str, policy: str, what: str, values: Iterable[str]) -> str:
-        return f"| {setting} | {policy} | {what} | {' | '.join(values)} |"
-
     for cell in cells:
-        told = cell.key.setting, _called(cell.key)
-        there = cell.returns.keys()
-        yield line(*told, "return", (mean_and_error(_of(cell, r)) if r in there else "" for r in rungs))
-        yield line(*told, "critic", (f"{cell.q[r]:.0f} ({drift(cell.q, r):+.1%})" if r in there else "" for r in rungs))
+        told = {rung: (mean_and_error(_of(cell, rung)), drift(cell.q, rung)) for rung in cell.returns}
         three = cell.held_out, cell.trained_on, cell.batches
-        losses = ("; ".join(f"{loss[r]:.3f}" for loss in three) if r in there else "" for r in rungs)
-        yield line(*told, "cloning", losses)
+        lines = {
+            "return": {rung: text for rung, (text, _) in told.items()},
+            "critic": {rung: f"{cell.q[rung]:.0f} ({moved:+.1%})" for rung, (_, moved) in told.items()},
+            "cloning": {rung: "; ".join(f"{loss[rung]:.3f}" for loss in three) for rung in told},
+        }
+        rows += [(cell.key.setting, cell.key.called, what, line) for what, line in lines.items()]
         other = by_key.get(cell.key._replace(method="mik+a"))
         if cell.key.method == "acro" and other:
-            values = (_less(other.returns[r], cell.returns[r]) if r in there else "" for r in rungs)
-            policies = ", ".join(filter(None, ("`mik+a` less `acro`", cell.key.lever)))
-            yield line(cell.key.setting, policies, "return", values)
-
-
-def _less(one: Mapping[int, float], other: Mapping[int, float]) -> str:
-    """Difference of mean returns, with its standard error over episodes paired by seed."""
-    text = mean_and_error([one[seed] - other[seed] for seed in one])
-    return text if text.startswith("-") else f"+{text}"
+            line = {}
+            for rung, one in cell.returns.items():  # with the standard error over the episodes' common starts
+                text = mean_and_error([value - one[seed] for seed, value in other.returns[rung].items()])
+                line[rung] = text if text.startswith("-") else f"+{text}"
+            rows.append((cell.key.setting, f"`mik+a` less {cell.key.called}", "return", line))
+    shown = ((*words, *(line.get(rung, "") for rung in rungs)) for *words, line in rows)
+    return table(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), shown, (0, 1, 2))
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """The rule's budget by task and width, and the cells that are missing."""
-    yield "| task | units | cells that count, of those asked for | updates by the rule | not run yet |"
-    yield "|---|---:|---:|---:|---|"
-    wanted: defaultdict[tuple[str, int], list[Key]] = defaultdict(list)
-    for key in sorted(filter(lambda key: key.counts, asked()), key=lambda key: (-ord(key.task[0]), key.units)):
-        wanted[key.task, key.units].append(key)
-    for (task, units), keys in wanted.items():
+    """The rule's budget per task and width, and the runs that it still lacks."""
+    wanted = groups((key for key in asked() if key.counts), lambda key: (key.task, key.units))
+    rows = []
+    for (task, units), keys in sorted(wanted.items(), key=lambda item: (-ord(item[0][0][0]), item[0][1])):
         mine = [cell for cell in cells if cell.key in keys]
-        there = {cell.key for cell in mine}
-        found = budget(mine)
+        there, found = {cell.key for cell in mine}, budget(mine)
         told = "–" if not mine else "no rung" if found is None else f"{found:,}"
-        missing = "; ".join(
-            f"{key.quality}, `{key.method}`" + ", nothing hidden" * (key.corruption == "none")
-            for key in keys
-            if key not in there
-        )
+        hidden = {key: ", nothing hidden" * (key.corruption == "none") for key in keys if key not in there}
+        missing = "; ".join(f"{key.quality}, `{key.method}`{words}" for key, words in hidden.items())
         told += " so far" * bool(mine and missing)
-        yield f"| {task} | {units:,} | {len(mine)} of {len(keys)} | {told} | {missing or 'all are there'} |"
+        rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", told, missing or "all are there"))
+    head = ("task", "units", "cells that count, of those asked for", "updates by the rule", "not run yet")
+    return table(head, rows, (0, 4))
 
 
 def figure(cells: Sequence[Cell]) -> Figure:
-    """One row of panels per dataset and corruption: returns, critic values and cloning losses over updates."""
-    panels: list[tuple[str, pd.DataFrame, Draw]] = []
-    for task, quality, corruption in dict.fromkeys(cell.key[:3] for cell in cells):
-        mine = [cell for cell in cells if cell.key[:3] == (task, quality, corruption)]
+    """One row of panels per dataset and corruption: returns, critic value, and cloning losses by updates."""
+    panels: list[tuple[str, Any, Any]] = []
+    for (task, quality, corruption), mine in groups(cells, lambda cell: cell.key[:3]).items():
         hidden = ", nothing hidden" * (corruption == "none")
         for title, draw in PANELS.items():
-            panels.append((f"{task} {quality}{hidden}: {title}", pd.DataFrame(), partial(_draw, draw, mine)))
+            panels.append((f"{task} {quality}{hidden}: {title}", mine, partial(_draw, draw)))
     return sheet(panels)
 
 
-def _draw(draw: Callable[[Axes, Cell, Look], None], cells: Sequence[Cell], axes: Axes, _: pd.DataFrame) -> None:
+def _draw(draw: Any, axes: Axes, cells: Sequence[Cell]) -> None:
     for cell in cells:
         look = style(LOOKS[cell.key.method]) | {"linestyle": LEVERS[cell.key.lever], "lw": 1.3, "markersize": 3}
         draw(axes, cell, look)
     axes.set(xlim=(0, None), ylim=(0, None), xlabel="gradient updates, thousands")
 
 
-def _draw_returns(axes: Axes, cell: Cell, look: Look) -> None:
+def _draw_returns(axes: Axes, cell: Cell, look: dict[str, Any]) -> None:
     """Returns with standard errors over episodes."""
     rungs = np.array(sorted(cell.returns))
     means = np.array([np.mean(_of(cell, rung)) for rung in rungs])
-    errors = np.array([np.std(_of(cell, rung), ddof=1) / len(_of(cell, rung)) ** 0.5 for rung in rungs])
-    axes.plot(rungs / 1000, means, label=", ".join(filter(None, (cell.key.method, cell.key.lever))), **look)
+    errors = np.array([np.std(_of(cell, rung), ddof=1) / len(cell.returns[rung]) ** 0.5 for rung in rungs])
+    axes.plot(rungs / 1000, means, label=cell.key.called.replace("`", ""), **look)
     axes.fill_between(rungs / 1000, means - errors, means + errors, color=look["color"], alpha=0.15, lw=0)
 
 
-def _draw_critic(axes: Axes, cell: Cell, look: Look) -> None:
+def _draw_critic(axes: Axes, cell: Cell, look: dict[str, Any]) -> None:
     """Critic values, and the data's own; dots mark rungs at which the critic has converged."""
     steps = sorted(cell.q)
     marked = [steps.index(rung) for rung in cell.converged()]
@@ -313,12 +288,10 @@ def _draw_critic(axes: Axes, cell: Cell, look: Look) -> None:
     axes.axhline(cell.data_value, color="black", lw=0.8, linestyle=":")
 
 
-def _draw_losses(axes: Axes, cell: Cell, look: Look) -> None:
+def _draw_losses(axes: Axes, cell: Cell, look: dict[str, Any]) -> None:
     """Cloning losses: on held-out episodes, fainter on training episodes, faintest on training batches."""
-    unmarked = {"marker": None}
-    for losses, faint in (
-        (cell.held_out, {}), (cell.trained_on, {"alpha": 0.5} | unmarked), (cell.batches, {"alpha": 0.25} | unmarked)
-    ):  # fmt: skip
+    for losses, alpha in ((cell.held_out, None), (cell.trained_on, 0.5), (cell.batches, 0.25)):
+        faint = {"alpha": alpha, "marker": None} if alpha else {}
         axes.plot(np.array(sorted(losses)) / 1000, [losses[rung] for rung in sorted(losses)], **(look | faint))
     if not axes.texts:
         key = "dots: held-out episodes\nfainter: episodes of the set\nfaintest: batches of training"

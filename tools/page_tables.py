@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import ladder_table
-import navigation_table
-import offline_table
+import ladder_table as ladder
+import navigation_table as mazes
+import offline_table as offline
 from script import run_script
 
 from vd4rl_pomdp.core.errors import UserError
@@ -32,41 +32,34 @@ class Config:
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, by the page's path in the repository."""
-    methods = offline_table.runs_of(["methods"], ["methods", "offline", "control"])
-    returns, mazes, rungs = offline_table.main_runs(), navigation_table.numbers_in(), ladder_table.cells_in()
-    return {
-        "results/control/README.md": {
-            "gates": offline_table.gate_lines(returns),
-            "ranks": offline_table.rank_lines(returns),
+    methods, returns = offline.runs_of(["methods"], ["methods", "offline", "control"]), offline.main_runs()
+    numbers, rungs, condition = mazes.numbers_in(), ladder.cells_in(), mazes.Condition("", "")
+    by_k = [(f"K = {k}", condition._replace(max_k=k)) for k in (15, 1)]
+    tables: dict[str, Tables] = {
+        "control": {"gates": offline.gate_lines(returns), "ranks": offline.rank_lines(returns)},
+        "ladder": {
+            "runs": ladder.run_lines(rungs),
+            "rungs": ladder.rung_lines(rungs),
+            "budget": ladder.budget_lines(rungs),
         },
-        "results/ladder/README.md": {
-            "runs": ladder_table.run_lines(rungs),
-            "rungs": ladder_table.rung_lines(rungs),
-            "budget": ladder_table.budget_lines(rungs),
+        "methods": {"methods": offline.method_lines(methods)},
+        "navigation": {
+            "mazes": mazes.state_lines(numbers, by_k),
+            "three_curtains": mazes.maze_lines(numbers, "three_curtains"),
+            "textures": mazes.state_lines(numbers, [("textures", condition._replace(exogenous=True))]),
+            "budget": mazes.budget_lines(numbers, mazes.numbers_in("budget")),
         },
-        "results/methods/README.md": {"methods": offline_table.method_lines(methods)},
-        "results/navigation/README.md": {
-            "mazes": navigation_table.state_lines(mazes, (15, 1)),
-            "three_curtains": navigation_table.maze_lines(mazes, "three_curtains"),
-            "textures": navigation_table.texture_lines(mazes),
-            "budget": navigation_table.budget_lines(mazes, navigation_table.numbers_in(navigation_table.LONGER)),
-        },
-        "results/navigation/longer/README.md": {"hard": navigation_table.hard_lines(mazes)},
-        "results/navigation/first_person/README.md": {
-            "first person": navigation_table.first_person_lines(navigation_table.numbers_in("first_person"))
-        },
-        "results/navigation/first_person/pictures/README.md": {
-            "pictures": navigation_table.picture_lines(mazes),
-        },
-        "results/navigation/first_person/small/README.md": {
-            "first rung": navigation_table.first_rung_lines(navigation_table.numbers_in("first_person/small")),
-        },
-        "results/offline/README.md": {
-            "returns": offline_table.return_lines(returns),
-            "contrasts": offline_table.contrast_lines(returns),
-            "aggregate": offline_table.aggregate_lines(returns),
+        "navigation/longer": {"hard": mazes.hard_lines(numbers)},
+        "navigation/first_person": {"first person": mazes.first_person_lines(mazes.numbers_in("first_person"))},
+        "navigation/first_person/pictures": {"pictures": mazes.picture_lines(numbers)},
+        "navigation/first_person/small": {"first rung": mazes.first_rung_lines(mazes.numbers_in("first_person/small"))},
+        "offline": {
+            "returns": offline.return_lines(returns),
+            "contrasts": offline.contrast_lines(returns),
+            "aggregate": offline.aggregate_lines(returns),
         },
     }
+    return {f"results/{place}/README.md": told for place, told in tables.items()}
 
 
 def with_tables(text: str, tables: Tables, page: str) -> str:
@@ -78,10 +71,8 @@ def with_tables(text: str, tables: Tables, page: str) -> str:
     lines = text.split("\n")
     for name, table in tables.items():
         mark = MARK.format(name)
-        if lines.count(mark) != 1:
-            raise UserError(
-                f"{page}: one line `{mark}` is wanted, above where that table belongs; {lines.count(mark)} found"
-            )
+        if (count := lines.count(mark)) != 1:
+            raise UserError(f"{page}: one line `{mark}` is wanted, above where that table belongs; {count} found")
         start = end = lines.index(mark) + 1
         while end < len(lines) and lines[end].startswith("|"):
             end += 1
@@ -91,11 +82,10 @@ def with_tables(text: str, tables: Tables, page: str) -> str:
 
 def main(config: Config) -> None:
     """Write all pages, or none if a mark is missing."""
-    written = {
-        page: with_tables((ROOT / page).read_text(encoding="utf-8"), tables, page) for page, tables in pages().items()
-    }
-    for page, text in written.items():
-        (ROOT / page).write_text(text, encoding="utf-8")
+    found = [(ROOT / page, page, tables) for page, tables in pages().items()]
+    written = {path: with_tables(path.read_text(encoding="utf-8"), tables, page) for path, page, tables in found}
+    for path, text in written.items():
+        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ rliable ignores its seed, so there are enough bootstrap samples for intervals to
 """
 
 import json
-import sys
 
 import numpy as np
 from rliable import library, metrics
@@ -19,56 +18,39 @@ THRESHOLDS = np.linspace(0, 1, 11)
 
 
 def main() -> None:
-    """Print scores and rliable's statistics as JSON."""
+    """Print the scores, and rliable's statistics of them, as JSON."""
     rng = np.random.default_rng(0)
     level = rng.uniform(0.2, 0.9, TASKS)
     scores = {
         name: np.round(level + shift + rng.normal(0, 0.15, (SEEDS, TASKS)), 2)
         for name, shift in (("one", 0.05), ("other", 0.0))
     }
-    told = {name: _aggregates(values) | _profile(values) for name, values in scores.items()}
-    json.dump(
-        {
-            "rliable": "1.2.0",
-            "replicates": REPLICATES,
-            "thresholds": THRESHOLDS.tolist(),
-            "scores": {name: values.T.tolist() for name, values in scores.items()},
-            "statistics": told,
-            "improvement": _improvement(scores["one"], scores["other"]),
-        },
-        sys.stdout,
-    )
-    print()
-
-
-def _aggregates(scores: np.ndarray) -> dict[str, list[float]]:
-    """For each statistic of (seeds, tasks) scores: its value and interval."""
-
-    def all_of(values: np.ndarray) -> np.ndarray:
-        return np.array(
-            [
-                metrics.aggregate_iqm(values),
-                metrics.aggregate_median(values),
-                metrics.aggregate_mean(values),
-                metrics.aggregate_optimality_gap(values),
-            ]
-        )
-
-    points, ends = library.get_interval_estimates({"x": scores}, all_of, reps=REPLICATES)
-    names = ("iqm", "median", "mean", "optimality_gap")
-    return {name: [points["x"][i], *ends["x"][:, i]] for i, name in enumerate(names)}
-
-
-def _profile(scores: np.ndarray) -> dict[str, list[float]]:
-    shares, bands = library.create_performance_profile({"x": scores}, THRESHOLDS, reps=REPLICATES // 10)
-    return {"profile": shares["x"].tolist(), "low": bands["x"][0].tolist(), "high": bands["x"][1].tolist()}
-
-
-def _improvement(one: np.ndarray, other: np.ndarray) -> list[float]:
+    both = scores["one"], scores["other"]
     chance, ends = library.get_interval_estimates(
-        {"x": (one, other)}, metrics.probability_of_improvement, reps=REPLICATES // 10
+        {"x": both}, metrics.probability_of_improvement, reps=REPLICATES // 10
     )
-    return [float(chance["x"]), *map(float, ends["x"].ravel())]
+    told = {
+        "rliable": "1.2.0",
+        "replicates": REPLICATES,
+        "thresholds": THRESHOLDS.tolist(),
+        "scores": {name: values.T.tolist() for name, values in scores.items()},
+        "statistics": {name: _statistics(values) for name, values in scores.items()},
+        "improvement": [float(chance["x"]), *map(float, ends["x"].ravel())],
+    }
+    print(json.dumps(told))
+
+
+def _statistics(scores: np.ndarray) -> dict[str, list[float]]:
+    """By statistic of (seeds, tasks) scores: value and interval; the performance profile and its band."""
+    names = ("iqm", "median", "mean", "optimality_gap")
+    functions = [getattr(metrics, f"aggregate_{name}") for name in names]
+    points, ends = library.get_interval_estimates(
+        {"x": scores}, lambda values: np.array([function(values) for function in functions]), reps=REPLICATES
+    )
+    found = {name: [points["x"][i], *ends["x"][:, i]] for i, name in enumerate(names)}
+    shares, bands = library.create_performance_profile({"x": scores}, THRESHOLDS, reps=REPLICATES // 10)
+    low, high = bands["x"]
+    return found | {"profile": shares["x"].tolist(), "low": low.tolist(), "high": high.tolist()}
 
 
 if __name__ == "__main__":

@@ -19,26 +19,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+import export_actor as exporting
 import jax
 import numpy as np
 import optax
 import tyro
-from export_actor import (
-    CARD_SEED,
-    CURVE,
-    CURVE_COLUMNS,
-    NETWORKS,
-    PROGRESS,
-    SETTINGS,
-    StateEnv,
-    episode_returns,
-    export_run,
-    exported_actors,
-    read_curve,
-    snapshot_path,
-)
+from export_actor import StateEnv, episode_returns, export_run, exported_actors, read_curve, snapshot_path
 from safetensors.numpy import load, save
 from sbx import SAC
+from script import one_line_errors
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -109,16 +98,8 @@ class PolicyConfig:
     """After --start-from: updates of the critics alone, before the actor is trained."""
 
 
-_STEADY = PolicyConfig(
-    "",
-    Path(),
-    learning_rate=5e-4,
-    critic_norm=True,
-    normalise=True,
-    n_step=3,
-    temperature_rate=1e-4,
-    target_entropy=-0.5,
-)
+_STEADY = PolicyConfig("", Path(), learning_rate=5e-4, critic_norm=True, normalise=True, n_step=3)
+_STEADY = replace(_STEADY, temperature_rate=1e-4, target_entropy=-0.5)
 """Settings of all tasks but walker_walk."""
 _GENERAL = replace(_STEADY, decisions=600_000, envs=4, temperature=0.1, replay_size=800_000, eval_every=4_000)
 """Settings of a task without a recipe: cheetah_run's."""
@@ -127,13 +108,8 @@ RECIPES: dict[str, PolicyConfig] = {
     "walker_walk": PolicyConfig("walker_walk", Path()),
     "cheetah_run": replace(_GENERAL, task="cheetah_run"),
     "humanoid_walk": replace(
-        _STEADY,
-        task="humanoid_walk",
-        decisions=20_000_000,
-        envs=16,
-        updates_per_decision=0.5,
-        temperature=0.01,
-        eval_every=24_000,
+        replace(_STEADY, task="humanoid_walk", decisions=20_000_000, envs=16, eval_every=24_000),
+        **{"updates_per_decision": 0.5, "temperature": 0.01},
     ),
     "reacher_jump": replace(_SMALL, task="reacher_jump"),
     "point_mass_cue": replace(_SMALL, task="point_mass_cue"),
@@ -166,20 +142,27 @@ def build(config: PolicyConfig, task: Task) -> SAC:
         seed=config.seed,
     )
     model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
-    _set_temperature_rate(model, config.temperature_rate)
-    return model
-
-
-def _set_temperature_rate(model: SAC, rate: float) -> None:
-    """Give the temperature its own learning rate; SBX uses the actor's."""
-    state, optimiser = model.ent_coef_state, optax.adam(rate)
+    # the temperature has its own learning rate; SBX uses the actor's
+    state, optimiser = model.ent_coef_state, optax.adam(config.temperature_rate)
     model.ent_coef_state = state.replace(tx=optimiser, opt_state=optimiser.init(state.params))
+    return model
 
 
 def export_actor(model: SAC, config: PolicyConfig, decisions: int) -> Actor:
     """The learner's policy as an `Actor`."""
     params = model.policy.actor_state.params["params"]
-    weights = _simba_weights(params) if config.network == "simba" else _mlp_weights(params)
+    if config.network == "simba":
+        layers = {"embed": params["Dense_0"], "norm": params["LayerNorm_0"]}
+        layers |= {"mean": params["Dense_1"], "log_std": params["Dense_2"]}
+        for i in range(sum(name.startswith("SimbaResidualBlock") for name in params)):
+            block = params[f"SimbaResidualBlock_{i}"]
+            layers |= {f"block.{i}.norm": block["LayerNorm_0"], f"block.{i}.up": block["Dense_0"]}
+            layers[f"block.{i}.down"] = block["Dense_1"]
+    else:
+        names = [*(f"hidden.{i}" for i in range(len(params) - 2)), "mean", "log_std"]
+        layers = {name: params[f"Dense_{i}"] for i, name in enumerate(names)}
+    ours = {"kernel": "weight", "scale": "scale", "bias": "bias"}
+    weights = {f"{name}.{ours[kind]}": value for name, layer in layers.items() for kind, value in layer.items()}
     if config.normalise:
         envs = model.get_vec_normalize_env()
         weights["observation.mean"] = envs.obs_rms.mean
@@ -189,50 +172,40 @@ def export_actor(model: SAC, config: PolicyConfig, decisions: int) -> Actor:
     return Actor({name: np.asarray(value, np.float32) for name, value in weights.items()}, card)
 
 
-def _mlp_weights(params: Any) -> dict[str, Any]:
-    """Dense layers in order: the hidden ones, mean and log_std."""
-    names = [f"hidden.{i}" for i in range(len(params) - 2)] + ["mean", "log_std"]
-    return {key: value for i, name in enumerate(names) for key, value in _dense(name, params[f"Dense_{i}"]).items()}
+def _arrays(model: SAC, states: Any) -> dict[str, np.ndarray]:
+    """A tree's leaves, and observation statistics."""
+    arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(jax.tree_util.tree_leaves(states))}
+    rms: Any = model.get_vec_normalize_env()
+    names = STATISTICS if rms.norm_obs else ()
+    return arrays | {f"observation.{name}": np.asarray(getattr(rms.obs_rms, name), np.float64) for name in names}
 
 
-def _simba_weights(params: Any) -> dict[str, Any]:
-    weights = _dense("embed", params["Dense_0"]) | _norm("norm", params["LayerNorm_0"])
-    weights |= _dense("mean", params["Dense_1"]) | _dense("log_std", params["Dense_2"])
-    for i in range(sum(name.startswith("SimbaResidualBlock") for name in params)):
-        block = params[f"SimbaResidualBlock_{i}"]
-        weights |= _norm(f"block.{i}.norm", block["LayerNorm_0"])
-        weights |= _dense(f"block.{i}.up", block["Dense_0"]) | _dense(f"block.{i}.down", block["Dense_1"])
-    return weights
+def _restored(model: SAC, states: Any, path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """The tree whose `_arrays` a file holds, and all that it holds; sets observation statistics.
 
-
-def _dense(name: str, layer: Any) -> dict[str, Any]:
-    return {f"{name}.weight": layer["kernel"], f"{name}.bias": layer["bias"]}
-
-
-def _norm(name: str, layer: Any) -> dict[str, Any]:
-    return {f"{name}.scale": layer["scale"], f"{name}.bias": layer["bias"]}
-
-
-def save_networks(model: SAC, path: Path) -> None:
-    """Write actor, critics, temperature and observation statistics to one small file, without optimisers."""
-    leaves, _ = jax.tree_util.tree_flatten(_networks(model))
-    arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
-    write_bytes(path, save(arrays))
-
-
-def start_from_networks(model: SAC, path: Path) -> None:
-    """Load the file of `save_networks`; the target critics become copies of the critics."""
+    Raises:
+        UserError: leaves have other shapes.
+    """
     stored = load(path.read_bytes())
-    leaves, structure = jax.tree_util.tree_flatten(_networks(model))
-    if any(f"{i:04d}" not in stored or stored[f"{i:04d}"].shape != leaf.shape for i, leaf in enumerate(leaves)):
+    leaves, structure = jax.tree_util.tree_flatten(states)
+    found = [stored.get(f"{i:04d}", np.empty(0)) for i in range(len(leaves))]
+    if any(one.shape != np.shape(leaf) for one, leaf in zip(found, leaves, strict=True)):
         raise UserError(f"{path}: holds networks of another shape; use the --network and --hidden they were made with")
-    loaded = [jax.numpy.asarray(stored[f"{i:04d}"]) for i in range(len(leaves))]
-    actor, critics, temperature = jax.tree_util.tree_unflatten(structure, loaded)
+    cast = [jax.numpy.asarray(one.astype(np.asarray(leaf).dtype)) for one, leaf in zip(found, leaves, strict=True)]
+    rms: Any = model.get_vec_normalize_env()
+    for name in STATISTICS if rms.norm_obs else ():
+        setattr(rms.obs_rms, name, stored[f"observation.{name}"])
+    return jax.tree_util.tree_unflatten(structure, cast), stored
+
+
+def _states(model: SAC) -> tuple[Any, ...]:
+    """Everything SBX learns, including optimisers, and its random keys."""
     policy = model.policy
-    policy.actor_state = policy.actor_state.replace(params=actor)
-    policy.qf_state = policy.qf_state.replace(params=critics, target_params=critics)
-    model.ent_coef_state = model.ent_coef_state.replace(params=temperature)
-    _set_statistics(model, stored)
+    return policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key
+
+
+def _networks(model: SAC) -> tuple[Any, ...]:
+    return model.policy.actor_state.params, model.policy.qf_state.params, model.ent_coef_state.params
 
 
 def refill(model: SAC, decisions: int, critic_updates: int) -> None:
@@ -252,10 +225,9 @@ def refill(model: SAC, decisions: int, critic_updates: int) -> None:
 
 def save_checkpoint(model: SAC, run: Path) -> None:
     """Write the whole training state, replacing the previous checkpoint."""
-    leaves, _ = jax.tree_util.tree_flatten(_states(model))
     buffer: Any = model.replay_buffer
     stop = buffer.buffer_size if buffer.full else buffer.pos
-    arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
+    arrays = _arrays(model, _states(model))
     arrays |= {f"replay.{k}": np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}
     arrays["counters"] = np.array([model.num_timesteps, model._n_updates, buffer.pos])
     write_bytes(run / CHECKPOINT, save(arrays))
@@ -265,15 +237,12 @@ def restore_checkpoint(model: SAC, run: Path) -> int:
     """Load the checkpoint; returns the decisions made so far, 0 without one. Episodes start anew."""
     if not (run / CHECKPOINT).exists():
         return 0
-    stored = load((run / CHECKPOINT).read_bytes())
+    states, stored = _restored(model, _states(model), run / CHECKPOINT)
     decisions, updates, position = map(int, stored["counters"])
-    model.set_random_seed(_seed_from(model.seed or 0, decisions))
+    # episodes differ from those at the start and from evaluation; Gymnasium increments the seed
+    model.set_random_seed(stream_seed(model.seed or 0, "policy", "resumed", decisions) % 2**31)
     policy, buffer = model.policy, model.replay_buffer
-    leaves, structure = jax.tree_util.tree_flatten(_states(model))
-    restored = [np.asarray(stored[f"{i:04d}"], dtype=np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)]
-    states = jax.tree_util.tree_unflatten(structure, [jax.numpy.asarray(leaf) for leaf in restored])
     policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key = states
-    _set_statistics(model, stored)
     stop = len(stored["replay.rewards"])
     for name in REPLAY_ARRAYS:
         getattr(buffer, name)[:stop] = stored[f"replay.{name}"]
@@ -281,35 +250,6 @@ def restore_checkpoint(model: SAC, run: Path) -> int:
     buffer.timeouts[position - 1] = True  # interrupted episodes are not continued
     model.num_timesteps, model._n_updates = decisions, updates
     return decisions
-
-
-def _seed_from(seed: int, decisions: int) -> int:
-    """Seed after resuming: episodes differ from those at the start and from evaluation. Gymnasium increments it."""
-    return stream_seed(seed, "policy", "resumed", decisions) % 2**31
-
-
-def _states(model: SAC) -> tuple[Any, ...]:
-    """Everything SBX learns, including optimisers, and its random keys."""
-    policy = model.policy
-    return policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key
-
-
-def _networks(model: SAC) -> tuple[Any, ...]:
-    return model.policy.actor_state.params, model.policy.qf_state.params, model.ent_coef_state.params
-
-
-def _statistics(model: SAC) -> dict[str, np.ndarray]:
-    envs: Any = model.get_vec_normalize_env()
-    if not envs.norm_obs:
-        return {}
-    return {f"observation.{name}": np.asarray(getattr(envs.obs_rms, name), np.float64) for name in STATISTICS}
-
-
-def _set_statistics(model: SAC, stored: dict[str, np.ndarray]) -> None:
-    envs: Any = model.get_vec_normalize_env()
-    if envs.norm_obs:
-        for name in STATISTICS:
-            setattr(envs.obs_rms, name, stored[f"observation.{name}"])
 
 
 def train_actor(config: PolicyConfig) -> dict[str, Path]:
@@ -332,11 +272,11 @@ def train_actor(config: PolicyConfig) -> dict[str, Path]:
         model.learn(min(config.eval_every, config.decisions - done), reset_num_timesteps=done == 0)
         done = int(model.num_timesteps)
         actor = export_actor(model, config, done)
-        returns = episode_returns(actor, task, config.eval_episodes, CARD_SEED - config.eval_episodes)
+        returns = episode_returns(actor, task, config.eval_episodes, exporting.CARD_SEED - config.eval_episodes)
         curve.append((done, float(np.mean(returns))))
         actor.save(snapshot_path(run, done))
         _write_curve(run, curve)
-        save_networks(model, run / NETWORKS)
+        write_bytes(run / exporting.NETWORKS, save(_arrays(model, _networks(model))))
         save_checkpoint(model, run)
         print(f"{config.task}: {done:,} of {config.decisions:,} decisions, mean return {curve[-1][1]:.1f}", flush=True)
     return export_run(run, run)
@@ -346,7 +286,7 @@ def _begin(config: PolicyConfig) -> None:
     """Write a new run's settings, or reject settings that differ from an existing run's. Its length may change."""
     kept = {k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")}
     kept["start_from"] = None if config.start_from is None else str(config.start_from)
-    path = config.out / SETTINGS
+    path = config.out / exporting.SETTINGS
     if path.exists():
         stored = json.loads(path.read_text(encoding="utf-8"))
         if differing := [name for name, value in kept.items() if stored.get(name) != value]:
@@ -354,19 +294,23 @@ def _begin(config: PolicyConfig) -> None:
         return
     if config.out.exists() and any(config.out.iterdir()):
         raise UserError(f"{config.out}: is not empty and holds no training run; choose another --out")
-    if config.start_from is not None and not all((config.start_from / name).exists() for name in PROGRESS):
-        raise UserError(f"{config.start_from}: lacks one of {', '.join(PROGRESS)}; name the folder of a run")
+    if config.start_from is not None and not all((config.start_from / name).exists() for name in exporting.PROGRESS):
+        raise UserError(f"{config.start_from}: lacks one of {', '.join(exporting.PROGRESS)}; name the folder of a run")
     config.out.mkdir(parents=True, exist_ok=True)
     write_bytes(path, (json.dumps(kept, indent=1) + "\n").encode())
 
 
 def _start_from(model: SAC, config: PolicyConfig, start: Path) -> list[tuple[int, float]]:
     """Copy another run's networks, curve (returned) and snapshots; its replay buffer is filled anew."""
-    start_from_networks(model, start / NETWORKS)
+    (actor, critics, temperature), _ = _restored(model, _networks(model), start / exporting.NETWORKS)
+    policy = model.policy
+    policy.actor_state = policy.actor_state.replace(params=actor)
+    policy.qf_state = policy.qf_state.replace(params=critics, target_params=critics)
+    model.ent_coef_state = model.ent_coef_state.replace(params=temperature)
     curve = read_curve(start)
     (config.out / "snapshots").mkdir(exist_ok=True)
-    for step, actor in exported_actors(start, config.task):
-        actor.save(snapshot_path(config.out, step))
+    for step, exported in exported_actors(start, config.task):
+        exported.save(snapshot_path(config.out, step))
     for step, _ in curve:
         if snapshot_path(start, step).exists():
             shutil.copy(snapshot_path(start, step), snapshot_path(config.out, step))
@@ -377,8 +321,8 @@ def _start_from(model: SAC, config: PolicyConfig, start: Path) -> list[tuple[int
 
 
 def _write_curve(run: Path, curve: list[tuple[int, float]]) -> None:
-    lines = [",".join(CURVE_COLUMNS), *(f"{step},{mean:.3f}" for step, mean in curve)]
-    write_bytes(run / CURVE, ("\n".join(lines) + "\n").encode())
+    lines = ["decisions,return_mean", *(f"{step},{mean:.3f}" for step, mean in curve)]
+    write_bytes(run / exporting.CURVE, ("\n".join(lines) + "\n").encode())
 
 
 def main() -> None:
@@ -388,12 +332,9 @@ def main() -> None:
         runpy.run_path(words.pop(0))
     recipes = {name: RECIPES.get(name, replace(_GENERAL, task=name)) for name in TASKS}
     presets = {name: (f"train on {name}", replace(recipe, out=tyro.MISSING)) for name, recipe in recipes.items()}
-    try:
+    with one_line_errors():
         for quality, path in train_actor(tyro.extras.overridable_config_cli(presets, args=words)).items():
             print(f"{quality}: {path}")
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import scipy.stats
 
 from tests.helpers_report import describe, write_run, write_seeds
 from vd4rl_pomdp.report import print_summary, write_report
-from vd4rl_pomdp.report.claims import CLAIMS, judge_claims
+from vd4rl_pomdp.report.gates import CLAIMS, judge_claims
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -93,16 +93,9 @@ def test_claims_of_a_family_are_tested_together_and_others_by_themselves(tmp_pat
         sides = ([10 * score for score in (scores | gru)[name]] for name in ((left, under), (right, "patch")))
         return scipy.stats.ttest_ind(*sides, equal_var=False).pvalue
 
-    families = {
-        "primary": {
-            MEMORY: p("mik", "acro"),
-            GRU: p("gru", "acro"),
-            ACTIONS: p("mik+a", "mik"),
-            BOTH: p("mik+a", "acro"),
-        },
-        "second family": {OVER_AH: p("mik+a", "ah+a"), OVER_FJ: p("mik+a", "fj+a")},
-    }
-    for family, values in families.items():
+    primary = {MEMORY: p("mik", "acro"), GRU: p("gru", "acro"), ACTIONS: p("mik+a", "mik"), BOTH: p("mik+a", "acro")}
+    second = {OVER_AH: p("mik+a", "ah+a"), OVER_FJ: p("mik+a", "fj+a")}
+    for family, values in (("primary", primary), ("second family", second)):
         assert {claim: row["p"] for claim, row in rows.items() if row["family"] == family} == pytest.approx(values)
         highest = 0.0
         for rank, claim in enumerate(sorted(values, key=values.get)):
@@ -110,11 +103,8 @@ def test_claims_of_a_family_are_tested_together_and_others_by_themselves(tmp_pat
             assert rows[claim]["adjusted_p"] == pytest.approx(highest)
             assert rows[claim]["verdict"] == ("holds" if highest < 0.05 else "undecided")
     seen = rows["acro returns less where pixels are hidden"]
-    assert (seen["family"], seen["adjusted_p"], seen["p"]) == (
-        "exploratory",
-        None,
-        pytest.approx(p("acro", "acro", "none")),
-    )
+    assert (seen["family"], seen["adjusted_p"]) == ("exploratory", None)
+    assert seen["p"] == pytest.approx(p("acro", "acro", "none"))
     assert (rows[MEMORY]["verdict"], seen["verdict"]) == ("undecided", "holds")
     assert rows[MEMORY]["p"] < 0.05 < rows[MEMORY]["adjusted_p"], "it would hold alone"
 
@@ -164,10 +154,6 @@ def test_a_claim_is_told_of_the_same_policies_played_clean_too(tmp_path):
     assert "-400 [-430, -370]" in page
 
 
-def test_a_claim_of_which_a_side_was_not_run_has_no_row(tmp_path):
-    assert MEMORY not in judged(write(tmp_path, GOOD | {("mik", "patch"): ()}))
-
-
 def test_claims_are_about_methods_as_they_are_and_not_about_their_variants(tmp_path):
     write(tmp_path, GOOD)
     write(tmp_path, {("acro", "patch"): (40, 42)}, history="gru")
@@ -187,11 +173,7 @@ def test_runs_of_like_settings_are_compared_and_not_the_best_of_each_side(tmp_pa
 
 @pytest.mark.parametrize(
     ("settings", "words"),
-    [
-        ({"steps": 60}, "steps"),
-        ({"steps": 60, "max_k": 1}, "steps, max_k"),
-        ({"steps": 60, "preset": "paper"}, "pretraining preset"),
-    ],
+    [({"steps": 60, "max_k": 1}, "steps, max_k"), ({"steps": 60, "preset": "paper"}, "pretraining preset")],
 )
 def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, settings, words):
     write(tmp_path, GOOD | {("mik+a", "patch"): (), ("mik+a", "none"): ()})
@@ -203,14 +185,6 @@ def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, s
     assert rows[MEMORY]["verdict"] == "holds"
     states = rows["what is left to the states themselves"]
     assert (states["verdict"], states["difference"]) == ("", pytest.approx(760 - 910)), "states are not pretrained"
-
-
-def test_updates_of_fine_tuning_count_for_the_states_too(tmp_path):
-    write(tmp_path, GOOD)
-    for run in tmp_path.glob("mik+a-patch-*"):
-        describe(run, updates=500)
-    row = judged(tmp_path)["what is left to the states themselves"]
-    assert row["verdict"] == "not judged: other updates"
 
 
 def test_seeds_that_share_an_encoder_are_not_judged(tmp_path):
@@ -225,19 +199,6 @@ def test_a_setting_that_early_runs_do_not_record_is_the_methods_own(tmp_path):
     for seed in (0, 1):
         describe(write_run(tmp_path / f"acro{seed}", "acro", seed, {10: [20.0 + seed]}), seed=seed)
     assert judged(tmp_path) == {}, "no acro with a GRU was run"
-
-
-def test_the_states_count_once_a_seed_whatever_is_hidden(tmp_path):
-    row = judged(write(tmp_path, GOOD | {("state", "patch"): (30, 50)}))["what is left to the states themselves"]
-    assert (row["left_seeds"], row["left_return"]) == (2, pytest.approx(760)), "those that saw everything"
-    found = scipy.stats.ttest_ind([750, 770], [500, 540], equal_var=False).confidence_interval(0.95)
-    assert (row["low"], row["high"]) == pytest.approx(tuple(found))
-
-
-def test_nothing_is_judged_where_a_gate_is_missed(tmp_path):
-    report = write_report([write(tmp_path / "runs", GOOD | {("state", "none"): (9, 9)})], tmp_path / "out")
-    verdicts = {row["verdict"] for row in report.claims if row["kind"] != "distance"}
-    assert verdicts == {"not judged: undecided at this budget"}
 
 
 @pytest.mark.parametrize(
@@ -269,8 +230,6 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert "400 [339, 461]" in (tmp_path / "out" / "claims.tex").read_text()
     print_summary(report)
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, (
-        "mik returns more, with one seed"
-    )
+    assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, "one seed of mik is higher"
     assert f"{ACTIONS} (primary): holds in 0 of 1 setting; too few seeds in 1" in shown
     assert "told the states" not in shown

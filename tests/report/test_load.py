@@ -74,46 +74,43 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
     assert pooled(tmp_path / "runs") == {"acro": 2}
 
 
+A, B = "a" * 24, "b" * 24
 DIFFERENT = {
-    "steps": ({"card": {"steps": 20}}, {"card": {"steps": 60}}, ["steps 20", "steps 60"]),
-    "updates": ({"card": {}, "updates": 5}, {"card": {}, "updates": 9}, ["updates 5", "updates 9"]),
-    "same name": (
-        {"card": {"batch_size": 8}},
-        {"card": {"batch_size": 16}},
-        ["pretraining batch_size 8", "pretraining batch_size 16"],
-    ),
-    "data": (
-        {"card": {"data": "a" * 24}, "data": "a" * 24},
-        {"card": {"data": "b" * 24}, "data": "b" * 24},
-        ["data aaaaaaaa", "data bbbbbbbb"],
-    ),
+    # encoder's and policy's settings of two sets of runs, and their variants
+    "steps": ({"steps": 20}, {}, {"steps": 60}, {}, ["steps 20", "steps 60"]),
+    "updates": ({}, {"updates": 5}, {}, {"updates": 9}, ["updates 5", "updates 9"]),
+    "same name": ({"batch_size": 8}, {}, {"batch_size": 16}, {}, [f"pretraining batch_size {n}" for n in (8, 16)]),
+    "data": ({"data": A}, {"data": A}, {"data": B}, {"data": B}, ["data aaaaaaaa", "data bbbbbbbb"]),
     "data before": (
-        {"card": {"data": "a" * 24}, "data": "a" * 24},
-        {"card": {"data": "b" * 24}, "data": "a" * 24},
-        ["pretraining data the same", "pretraining data bbbbbbbb"],
+        {"data": A},
+        {"data": A},
+        {"data": B},
+        {"data": A},
+        [f"pretraining data {x}" for x in ("the same", B[:8])],
     ),
-    "new option": ({"card": {"m": 8}}, {"card": {}}, ["m 8", "m unset"]),
-    "plain": ({"card": {"history": "method"}}, {"card": {"history": "gru"}}, ["", "history gru"]),
-    "later": ({"card": {"m": 8}}, {"card": {"m": 8, "future_frames": "newest"}}, ["", "future_frames newest"]),
-    "views": ({"card": {}}, {"card": {}, "view_seed": 0}, ["", "view_seed 0"]),
+    "new option": ({"m": 8}, {}, {}, {}, ["m 8", "m unset"]),
+    "plain": ({"history": "method"}, {}, {"history": "gru"}, {}, ["", "history gru"]),
+    "later": ({"m": 8}, {}, {"m": 8, "future_frames": "newest"}, {}, ["", "future_frames newest"]),
+    "views": ({}, {}, {}, {"view_seed": 0}, ["", "view_seed 0"]),
     "two": (
-        {"card": {}, "random_histories": 0.0, "views": 4},
-        {"card": {}, "random_histories": 0.5, "views": 8},
+        {},
+        {"random_histories": 0.0},
+        {},
+        {"random_histories": 0.5, "views": 8},
         ["views 4", "views 8, random_histories 0.5"],
     ),
     "preset": (
-        {"card": {"preset": "cpu", "steps": 20}, "preset": "cpu", "views": 4},
-        {"card": {"preset": "smoke", "steps": 60}, "preset": "smoke", "views": 1},
-        ["preset cpu", "preset smoke"],
+        *({"preset": "cpu", "steps": 20}, {"preset": "cpu", "views": 4}),
+        *({"preset": "smoke", "steps": 60}, {"preset": "smoke", "views": 1}, ["preset cpu", "preset smoke"]),
     ),
 }
 
 
-@pytest.mark.parametrize(("one", "other", "words"), DIFFERENT.values(), ids=DIFFERENT)
-def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, words):
+@pytest.mark.parametrize(("card", "config", "other_card", "other", "words"), DIFFERENT.values(), ids=DIFFERENT)
+def test_runs_that_differ_are_rows_of_their_own(tmp_path, card, config, other_card, other, words):
     for seed in (0, 1):
-        for folder, settings in (("one", one), ("other", other)):
-            describe(write_run(tmp_path / f"runs/{folder}{seed}", "acro", seed, {10: [1.0]}), **settings)
+        for folder, before, own in (("one", card, config), ("other", other_card, other)):
+            describe(write_run(tmp_path / f"runs/{folder}{seed}", "acro", seed, {10: [1.0]}), before, **own)
     write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
     names = [", ".join(filter(None, ("acro", word))) for word in words]
     assert pooled(tmp_path / "runs") == dict.fromkeys(names, 2) | {"random": 1}
@@ -134,14 +131,6 @@ def corruptions_of(runs):
     return found
 
 
-def under_own_corruption(run, options, **config):
-    """Give a run an encoder that was trained under a corruption with options of its own, and settings."""
-    describe(run, options, **config)
-    card = read_json(run / "encoder" / "config.json")
-    card["pretrain"]["corruption"] = {"corruption": "patch"} | options
-    write_json(run / "encoder" / "config.json", card)
-
-
 def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tmp_path):
     for method, size in (("acro", 16), ("mik+a", 48), ("mik", 48)):
         for seed in (0, 1):
@@ -154,8 +143,11 @@ def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tm
 
 def test_an_option_is_not_a_corruptions_because_it_is_called_like_one_of_it(tmp_path):
     for gamma, discount in ((1, 0.9), (1, 0.99), (2, 0.99)):
-        run = write_run(tmp_path / f"acro{gamma}{discount}", "acro", 0, {10: [1.0]})
-        under_own_corruption(run, {"gamma": gamma}, gamma=discount)
+        options = {"gamma": gamma}
+        run = describe(write_run(tmp_path / f"acro{gamma}{discount}", "acro", 0, {10: [1.0]}), options, gamma=discount)
+        card = read_json(run / "encoder" / "config.json")
+        card["pretrain"]["corruption"] = {"corruption": "patch"} | options
+        write_json(run / "encoder" / "config.json", card)
     assert {(run.labels["corruption"], run.variant) for run in load_runs([tmp_path])} == {
         ("patch, gamma 1", "gamma 0.9"),
         ("patch, gamma 1", "gamma 0.99"),

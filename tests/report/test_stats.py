@@ -16,6 +16,9 @@ AGREES = 0.002
 """Largest difference from its bootstrap's intervals, of scores between 0 and 1."""
 
 
+mean = stats.aggregates([])["mean"]
+
+
 def bootstrap(strata, statistic, *how):
     return stats.bootstrap_intervals(strata, {"": statistic}, *how)[""]
 
@@ -33,7 +36,8 @@ def test_other_statistics_on_known_values():
     assert stats.probability_of_improvement([np.array([1.0, 2.0])], [np.array([1.0, 0.0])]) == pytest.approx(0.875)
     tasks = [np.array([0.0, 4.0]), np.array([9.0]), np.array([1.0])]
     assert stats.aggregates(tasks)["median"](np.concatenate(tasks)) == 2.0, "of the tasks' means 2, 9, 1"
-    assert stats.performance_profile(np.array([1.0, 3.0]), np.array([0.0, 2.0, 4.0])).tolist() == [1.0, 0.5, 0.0]
+    share, band = stats.performance_profile([np.array([1.0]), np.array([3.0])], np.array([0.0, 2.0, 4.0]), None)
+    assert (share.tolist(), band) == ([1.0, 0.5, 0.0], None)
 
 
 @pytest.mark.parametrize("count", [5, 10, 30])
@@ -41,7 +45,7 @@ def test_the_bootstrap_covers_as_theory_predicts(count):
     rng = np.random.default_rng(count)
     hits, trials = 0, 2000
     for _ in range(trials):
-        low, high = bootstrap([rng.normal(5, 1, count)], stats.mean, rng, 1000)
+        low, high = bootstrap([rng.normal(5, 1, count)], mean, rng, 1000)
         hits += low <= 5 <= high
     # resampled means spread by sqrt((n - 1) / n) standard errors, and the true mean is t-distributed about the sample's
     reach = scipy.stats.norm.ppf(0.975) * np.sqrt((count - 1) / count)
@@ -53,14 +57,14 @@ def test_the_bootstrap_covers_as_theory_predicts(count):
 def test_the_bootstrap_keeps_tasks_apart():
     rng = np.random.default_rng(0)
     # tasks far apart, no spread within: drawing across tasks would give an interval, drawing within gives none
-    low, high = bootstrap([np.full(4, 0.0), np.full(4, 100.0)], stats.mean, rng, 500)
+    low, high = bootstrap([np.full(4, 0.0), np.full(4, 100.0)], mean, rng, 500)
     assert low == high == 50.0
-    assert bootstrap([np.array([1.0])], stats.mean, rng) is None
+    assert bootstrap([np.array([1.0])], mean, rng) is None
 
 
 def test_the_bootstrap_of_a_mean_is_as_wide_as_its_standard_error():
     scores = np.arange(100) % 2.0  # a standard deviation of a half
-    low, high = bootstrap([scores], stats.mean, np.random.default_rng(0))
+    low, high = bootstrap([scores], mean, np.random.default_rng(0))
     assert (low, high) == pytest.approx((0.5 - 1.96 * 0.05, 0.5 + 1.96 * 0.05), abs=0.006)
 
 
@@ -79,9 +83,8 @@ def test_aggregates_are_those_of_an_independent_implementation(name, statistic):
 @pytest.mark.parametrize("name", list(METHODS))
 def test_profiles_are_those_of_an_independent_implementation(name):
     told, thresholds = RLIABLE["statistics"][name], np.array(RLIABLE["thresholds"])
-    shares = stats.performance_profile(np.concatenate(METHODS[name]), thresholds)
+    shares, (low, high) = stats.performance_profile(METHODS[name], thresholds, np.random.default_rng(0))
     assert shares == pytest.approx(np.array(told["profile"]), abs=1e-9)
-    low, high = stats.profile_band(METHODS[name], thresholds, np.random.default_rng(0))
     # shares are multiples of 1/32, and so are the ends of both bands: between two of them they may part
     step = 1 / sum(map(len, METHODS[name]))
     for found, expected in ((low, told["low"]), (high, told["high"])):
@@ -99,27 +102,18 @@ def test_improvement_is_that_of_independent_implementations():
     assert stats.improvement_interval(one, other, np.random.default_rng(0)) == pytest.approx((low, high), abs=0.005)
 
 
-@pytest.mark.parametrize("count", [4, 5, 7, 12, 15])
-def test_iqm_is_scipys_trimmed_mean_where_the_quartiles_fall_between_runs_and_else_within_their_neighbours(count):
-    scores = np.random.default_rng(count).normal(50, 20, count)
-    trimmed = scipy.stats.trim_mean(scores, 0.25)
-    assert (abs(stats.iqm(scores) - trimmed) < 1e-9) == (count % 4 == 0)
-    repeated = scipy.stats.trim_mean(np.repeat(scores, 4), 0.25)
-    assert stats.iqm(scores) == pytest.approx(repeated), "four copies of each run: a quarter is whole runs"
-
-
 def test_one_seed_gives_no_interval_and_a_seed_of_draws_gives_the_same_one():
     rng = np.random.default_rng
     one, many, thresholds = [np.array([1.0])], [np.arange(5.0)], np.array([1.0])
     assert stats.improvement_interval(one, many, rng(0)) is None
     assert stats.improvement_interval(many, one, rng(0)) is None
-    assert stats.profile_band([*one, *many], thresholds, rng(0)) is None
+    assert stats.performance_profile([*one, *many], thresholds, rng(0))[1] is None
     assert stats.mean_interval(np.ones((1, 20))) is None
     assert stats.difference_interval(np.eye(1, 3), np.eye(3)) is None
     for draw in (
         lambda seed: bootstrap(many, stats.iqm, rng(seed)),
         lambda seed: stats.improvement_interval(many, [np.arange(1.0, 6.0)], rng(seed)),
-        lambda seed: [*map(float, np.concatenate(stats.profile_band(many, np.arange(4.0), rng(seed), 50)))],
+        lambda seed: stats.performance_profile(many, np.arange(4.0), rng(seed), 50)[1].tolist(),
     ):
         assert draw(3) == draw(3)
     assert draw(3) != draw(4)
@@ -160,13 +154,8 @@ def test_a_difference_adds_the_errors_of_seeds_and_of_paired_episodes():
     found = stats.difference(one, other)
     value = one.mean() - other.mean()
     assert (found.value, found.error, found.free) == pytest.approx((value, sum(squares) ** 0.5, free))
-    assert found.p == pytest.approx(2 * scipy.stats.t.sf(abs(value) / sum(squares) ** 0.5, free))
-    assert found.smallest == pytest.approx(
-        (scipy.stats.t.ppf(0.975, free) + scipy.stats.t.ppf(0.8, free)) * found.error
-    )
-    low, high = found.interval
-    assert (low > 0) == (found.p < 0.05)
-    assert stats.difference_interval(one, other) == (low, high)
+    assert (found.interval[0] > 0) == (found.p < 0.05)
+    assert stats.difference_interval(one, other) == found.interval
 
 
 def test_holm_adjusts_a_family():

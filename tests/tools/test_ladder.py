@@ -111,9 +111,7 @@ def _loss(encoder, policy, data) -> float:
 def test_a_critic_has_converged_where_its_last_fifth_is_level(scripts):
     script = scripts("ladder_table")
     rising = {step: 100.0 + step for step in range(1, 101)}
-    assert script.drift(rising, 100) == pytest.approx(20 / 190.5, rel=1e-4), (
-        "a line's slope times its length, over its mean"
-    )
+    assert script.drift(rising, 100) == pytest.approx(20 / 190.5, rel=1e-4), "slope times length, over the mean"
     assert script.drift(rising, 50) == pytest.approx(10 / 145.5, rel=1e-4), "as if training had ended there"
     assert script.drift({step: -100.0 - step for step in rising}, 100) == pytest.approx(20 / 190.5, rel=1e-4)
     wavy = {step: 100.0 + (-1) ** step for step in range(1, 101)}
@@ -137,6 +135,4 @@ def test_a_budget_is_the_first_rung_where_every_critic_has_converged_and_held_ou
     assert script.budget([]) is None
     both = [cell(0.2, 0.3, 0.31, 0.4), cell(0.4, 0.4, 0.305, 0.3, rises=200)]
     assert script.budget(both) == 300, "the lowest of the rungs at which all critics have converged"
-    assert script.budget([cell(0.1, 0.2, 0.3, 0.4, rises=300)]) == 400, (
-        "what a rising critic has cloned counts for nothing"
-    )
+    assert script.budget([cell(0.1, 0.2, 0.3, 0.4, rises=300)]) == 400, "rungs of a rising critic do not count"

@@ -49,26 +49,15 @@ def wanted(has: list[str]) -> list[str]:
         there[canonicalize_name(name)] = version
     lines = (HERE / "packages.txt").read_text().splitlines()
     names = [canonicalize_name(line) for line in lines if line and not line.startswith("#")]
-    return [
-        name for name in names
-        if name not in there or (there[name] and name in ranges and there[name] not in ranges[name])
-    ]  # fmt: skip
+    other = {name for name, version in there.items() if version and name in ranges and version not in ranges[name]}
+    return [name for name in names if name not in there or name in other]
 
 
 def install(names: list[str], python: str, site: Path) -> None:
     """Install this package and others for another Python version into a folder."""
     platforms = [f"manylinux{which}_x86_64" for which in ("_2_28", "_2_27", "_2_24", "_2_17", "2014", "1")]
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--disable-pip-version-check",
-        "--no-deps",
-        "--no-compile",
-    ]
-    pip += ["--target", str(site)]
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    pip += ["--no-compile", "--target", str(site)]
     foreign = ["--only-binary=:all:", "--implementation", "cp", "--python-version", python, "--upgrade"]
     foreign += [word for platform in platforms for word in ("--platform", platform)]
     subprocess.run([*pip, *foreign, "-c", str(ROOT / "constraints.txt"), *names], check=True)

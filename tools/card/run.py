@@ -30,6 +30,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 PROGRAM = [sys.executable, "-P", "-m", "vd4rl_pomdp"]
@@ -78,15 +79,8 @@ class Session:
         if seconds <= 0:
             self.say(f"no time left for {shlex.join(words)}")
             return 143, ""
-        process = subprocess.Popen(
-            words,
-            env=self.env,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-        )
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "errors": "replace"}
+        process = subprocess.Popen(words, env=self.env, text=True, start_new_session=True, **pipes)
         lines: list[str] = []
 
         def read() -> None:
@@ -115,9 +109,8 @@ class Session:
 
     def describe(self) -> None:
         """Log the machine and its torch version."""
-        found = (
-            "import torch; print(torch.__version__, *map(torch.cuda.get_device_name, range(torch.cuda.device_count())))"
-        )
+        found = "from torch import __version__, cuda"
+        found += "; print(__version__, *map(cuda.get_device_name, range(cuda.device_count())))"
         code, told = self.run([sys.executable, "-c", found], 90, quiet=True)
         self.gpu = len(told.split()) > 1
         self.say(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, torch {told.strip()} ({code})")
@@ -126,9 +119,8 @@ class Session:
         """Choose an environment that renders a frame, with the GPU if possible: the machine's own, or with packed
         libraries."""
         files = [str(file) for folder in VENDORS for file in Path(folder).glob("egl_vendor.d/*nvidia*.json")]
-        own = {
-            "LD_LIBRARY_PATH": os.pathsep.join(filter(None, [str(HERE / "opengl"), os.environ.get("LD_LIBRARY_PATH")]))
-        }
+        folders = filter(None, [str(HERE / "opengl"), os.environ.get("LD_LIBRARY_PATH")])
+        own = {"LD_LIBRARY_PATH": os.pathsep.join(folders)}
         vendor = {"__EGL_VENDOR_LIBRARY_FILENAMES": files[0]} if files else {}
         before, found, told = dict(self.env), None, ""
         for more in ({}, own, vendor, own | vendor):
@@ -144,56 +136,32 @@ class Session:
             self.say(f"nothing draws here: {told.strip()[-500:]}")
 
 
-class GridPart:
-    """A grid: its sweep command, and the datasets that it needs."""
-
-    def __init__(self, session: Session, name: str, work: Path, home: Path | None, flags: list[str]) -> None:
-        self._session = session
-        file = HERE / name
-        self._words = [*PROGRAM, "sweep", "run", str(file) if file.is_file() else name, "--out", str(work / "runs")]
-        self._words += ["--data", str(work / "data"), *flags]
-        self._words += ["--done", str(home / "results")] if home and (home / "results").is_dir() else []
-
-    def collect(self, until: float) -> int:
-        """Collect its datasets, one after another, until a deadline; returns the exit code."""
-        code, plan = self._session.run([*self._words, "--dry-run"], until - time.monotonic(), quiet=True)
-        if code:
-            self._session.write(plan)
-            return code
-        self._session.say(plan.strip().splitlines()[-1])
-        for line in plan.splitlines():
-            command = shlex.split(line, comments=True)[1:]
-            if command[:2] == ["data", "collect"]:
-                code, told = self._session.run([*PROGRAM, *command], until - time.monotonic(), quiet=True)
-                self._session.say(f"{command[-1]}: {told if code else 'collected'}")
-                if code:
-                    return code
-        return 0
-
-    def train(self, until: float) -> int:
-        """Run the sweep until a deadline; returns the exit code."""
-        return self.collect(until) or self._session.run(self._words, until - time.monotonic())[0]
+def collect(session: Session, sweep: list[str], until: float) -> int:
+    """Collect a sweep's datasets, one after another, until a deadline; returns the exit code."""
+    code, plan = session.run([*sweep, "--dry-run"], until - time.monotonic(), quiet=True)
+    if code:
+        session.write(plan)
+        return code
+    session.say(plan.strip().splitlines()[-1])
+    for line in plan.splitlines():
+        command = shlex.split(line, comments=True)[1:]
+        if code == 0 and command[:2] == ["data", "collect"]:
+            code, told = session.run([*PROGRAM, *command], until - time.monotonic(), quiet=True)
+            session.say(f"{command[-1]}: {told if code else 'collected'}")
+    return code
 
 
-def run_tests(session: Session, seconds: float, grids: list[GridPart]) -> int:
+def run_tests(session: Session, seconds: float, sweeps: list[list[str]]) -> int:
     """Run the GPU tests while the grids' datasets are collected; returns the tests' exit code."""
     words = [sys.executable, "-m", "pytest", "-m", "gpu", "-v", "-ra", "--durations=0", "--durations-min=1"]
     words += ["-p", "no:cacheprovider", "--continue-on-collection-errors", "-c", str(HERE / "pyproject.toml")]
     files = [path for path in sorted((HERE / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
     until = time.monotonic() + session.left()
-    beside = threading.Thread(target=lambda: [grid.collect(until) for grid in grids], daemon=True)
+    beside = threading.Thread(target=lambda: [collect(session, sweep, until) for sweep in sweeps], daemon=True)
     beside.start()
     code, _ = session.run([*words, *map(str, files)], seconds)  # other files may import packages that are missing here
     beside.join()
     return code
-
-
-def restore(home: Path, runs: Path) -> None:
-    """Copy encoders from an earlier invocation to where the sweep finds them."""
-    parts = sorted(home.glob("encoders.tar.*"))
-    if parts:
-        with tarfile.open(fileobj=io.BytesIO(b"".join(part.read_bytes() for part in parts))) as file:
-            file.extractall(runs, filter="data")
 
 
 def bring_home(session: Session, runs: Path, out: Path, mib: float) -> None:
@@ -240,25 +208,32 @@ def main() -> None:
     session = Session(told.out, told.seconds)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     told.work.mkdir(parents=True, exist_ok=True)
-    if told.home:
-        restore(told.home, told.work / "runs")
-        if (told.home / "results").is_dir() and told.home.resolve() != told.out.resolve():
-            shutil.copytree(told.home / "results", told.out / "results", dirs_exist_ok=True)
+    done = told.home and (told.home / "results").is_dir()
+    if told.home and (parts := sorted(told.home.glob("encoders.tar.*"))):  # to where the sweep finds them
+        with tarfile.open(fileobj=io.BytesIO(b"".join(part.read_bytes() for part in parts))) as file:
+            file.extractall(told.work / "runs", filter="data")
+    if done and told.home.resolve() != told.out.resolve():
+        shutil.copytree(told.home / "results", told.out / "results", dirs_exist_ok=True)
     session.describe()
     session.find_renderer()
     try:
         parts = [(name, float(limit or "inf")) for name, _, limit in (part.partition("=") for part in told.parts)]
-        grids = {n: GridPart(session, n, told.work, told.home, flags) for n, _ in parts if n not in ("tests", "bench")}
+        words = ["--out", str(told.work / "runs"), "--data", str(told.work / "data"), *flags]
+        words += ["--done", str(told.home / "results")] if done else []
+        files = {name: HERE / name for name, _ in parts if name not in ("tests", "bench")}
+        grids = {name: str(file) if file.is_file() else name for name, file in files.items()}
+        sweeps = {name: [*PROGRAM, "sweep", "run", grid, *words] for name, grid in grids.items()}
         for name, limit in parts:
             seconds, began = min(limit, session.left()), time.monotonic()
             session.say(f"{name}: {seconds:.0f} s at most")
             if name == "tests":
-                code = run_tests(session, seconds, list(grids.values()))
+                code = run_tests(session, seconds, list(sweeps.values()))
             elif name == "bench":
                 trial = [] if session.gpu else ["--quick", "--device", "cpu"]
                 code, _ = session.run([*PROGRAM, "bench", "--gpu", *trial], seconds)
             else:
-                code = grids[name].train(began + seconds)
+                code = collect(session, sweeps[name], began + seconds)
+                code = code or session.run(sweeps[name], began + seconds - time.monotonic())[0]
             session.say(f"{name}: {time.monotonic() - began:.1f} s, exit code {code}")
     finally:
         for process in session.processes:

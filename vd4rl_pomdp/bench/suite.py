@@ -51,7 +51,7 @@ from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.data import MazeData, open_maze_set
+from vd4rl_pomdp.studies.navigation.data import MazeData
 from vd4rl_pomdp.studies.navigation.train import make_trainer as make_maze_trainer
 
 GOALS: dict[str, tuple[str, float]] = {
@@ -489,7 +489,6 @@ def maze_training() -> dict[str, float]:
         folder = Path(name)
         collect(MazeCollectConfig.of("smoke", maze="no_curtain", out=folder / "set", workers=1))
         config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
-        data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
-        trainer, _ = make_maze_trainer(data, config, pick_device("auto"))
+        trainer, _ = make_maze_trainer(MazeData(config, folder / "cache"), config, pick_device("auto"))
     step, sampling, optimiser = alternating(5, trainer.update, trainer.batches.sample, trainer.optimiser.step)
     return {"training_steps_per_s": 1 / step, "training_overhead_share": (sampling + optimiser) / step}

@@ -67,10 +67,11 @@ def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: P
         b: The same, to compare with.
         out: Also write an HTML page, CSV and LaTeX into this folder.
     """
-    from vd4rl_pomdp.report.compare import check_out, compare_results, print_comparison, write_comparison
+    from vd4rl_pomdp.report.compare import FILE, compare_results, print_comparison, write_comparison
+    from vd4rl_pomdp.runs.outputs import refuse_foreign
 
     if out is not None:
-        check_out(out)
+        refuse_foreign(out, "comparison", f"{FILE}.csv")
     comparison = compare_results(a, b)
     page = None if out is None else write_comparison(comparison, out)
     print_comparison(comparison)

@@ -74,11 +74,7 @@ class ViewConfig(StageConfig):
 
 
 def write_view(config: ViewConfig) -> Path:
-    """Write the page and return its path.
-
-    Raises:
-        UserError: the dataset is damaged, the corruption does not fit its frames, or the file cannot be written.
-    """
+    """Write the page and return its path; UserError if the dataset, the corruption or the file does not allow it."""
     config.check()
     data = open_dataset(config.data)
     check_corruption_fits(config.corruption, data.frame_size)

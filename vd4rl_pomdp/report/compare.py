@@ -19,7 +19,6 @@ from vd4rl_pomdp.report.page import made_with
 from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.runs.files import Row, groups
-from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.results import certificates_of
 
 FILE = "comparison"
@@ -32,11 +31,9 @@ class SideBySide(NamedTuple):
     """Two sets of results side by side."""
 
     sides: list[Row]
-    """For each set its `path`, the number of runs that are `finished`, of `others` that are not compared, and the
-    commits and machines they were `made` with."""
+    """Of each set its `path`, numbers of `finished` runs and of `others`, not compared, and what it was `made` with."""
     rows: list[Row]
-    """One per condition: scores with intervals and n of both, difference with interval, differing settings, and what is
-    certified about memory."""
+    """One per condition: scores with intervals and n of both, difference with interval, differing settings, memory."""
 
 
 def compare_results(one: Path, other: Path) -> SideBySide:
@@ -62,7 +59,9 @@ def _loaded(path: Path) -> tuple[Row, Conditions]:
     runs = [run for run in load_runs([path]) if run.stage == "finetune"]
     finished = [run for run in runs if run.evaluated]
     if not finished:
-        raise UserError(f"{path}: holds no finished and evaluated run to compare; name one that does")
+        raise UserError(
+            f"{path}: holds no finished and evaluated run to compare; name one that does; name one that does"
+        )
     counts = {"finished": len(finished), "others": len(runs) - len(finished)}
     return {"path": path, **counts, "made": made_with(finished)}, groups(finished, lambda run: run.of(CONDITION))
 
@@ -70,8 +69,8 @@ def _loaded(path: Path) -> tuple[Row, Conditions]:
 def _partners(first: Conditions, second: Conditions) -> dict[tuple, tuple]:
     """Match conditions: first set's key -> second set's key, where there is a partner."""
     settings = {_what_was_done(runs): key for key, runs in second.items()}
-    equal = {key: settings.get(_what_was_done(runs)) for key, runs in first.items()}
-    found = {key: partner for key, partner in equal.items() if partner is not None}
+    done = {key: _what_was_done(runs) for key, runs in first.items()}
+    found = {key: settings[what] for key, what in done.items() if what in settings}
     free = second.keys() - set(found.values())
     for key in first.keys() - found.keys():
         # A method with a single variant in each set, whatever its settings.
@@ -107,12 +106,11 @@ def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
 
 def _differing(one: list[Run], other: list[Run]) -> str:
     """Settings whose values differ between both sets: "steps 20 → 60, views 4 → 1"."""
-    told = []
-    for name in dict.fromkeys(name for run in (*one, *other) for name in run.settings):
-        mine, theirs = (sorted({run.settings.get(name, "unset") for run in runs}) for runs in (one, other))
-        if mine != theirs:
-            told.append(f"{name} {' or '.join(mine)} → {' or '.join(theirs)}")
-    return ", ".join(told)
+    found = {
+        name: [" or ".join(sorted({run.settings.get(name, "unset") for run in runs})) for runs in (one, other)]
+        for name in dict.fromkeys(name for run in (*one, *other) for name in run.settings)
+    }
+    return ", ".join(f"{name} {mine} → {theirs}" for name, (mine, theirs) in found.items() if mine != theirs)
 
 
 _COLUMNS: Columns = {
@@ -133,9 +131,8 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side['others']} unfinished or diverged" if side["others"] else ""
-        console.print(
-            f"{name}: {side['path']}, {side['finished']} finished runs{others}", markup=False, highlight=False
-        )
+        told = f"{name}: {side['path']}, {side['finished']} finished runs{others}"
+        console.print(told, markup=False, highlight=False)
     shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
     method = shown["method"] + "\n  " + shown.pop("settings, A → B")
     for place, part in shown.assign(method=method).groupby("setting", sort=False):
@@ -143,27 +140,16 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
         console.print(terminal(str(place), part.drop(columns="setting").replace(r" \[", "\n[", regex=True)))
 
 
-def check_out(out: Path) -> None:
-    """Raise UserError for a folder that holds anything but an earlier comparison."""
-    refuse_foreign(out, "comparison", f"{FILE}.csv")
-
-
 def write_comparison(comparison: SideBySide, out: Path) -> Path:
-    """Write the comparison as page, CSV and LaTeX into a folder checked by `check_out`; returns the page."""
+    """Write the comparison as page, CSV and LaTeX into a folder of its own; returns the page."""
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     rows = pd.DataFrame(comparison.rows)
-    shown = texts(rows, _COLUMNS)
-    blocks = [
-        block(
-            str(place),
-            part.drop(columns="setting"),
-            2,
-            seeds_note(rows.loc[part.index, ["seeds_a", "seeds_b"]].stack())
-            + f" Memory: {rows['memory'][part.index[0]]}.",
-        )
-        for place, part in shown.groupby("setting", sort=False)
-    ]
+    shown, blocks = texts(rows, _COLUMNS), []
+    for place, part in shown.groupby("setting", sort=False):
+        note = seeds_note(rows.loc[part.index, ["seeds_a", "seeds_b"]].stack())
+        note += f" Memory: {rows['memory'][part.index[0]]}."
+        blocks.append(block(str(place), part.drop(columns="setting"), 2, note))
     write_table(out / f"{FILE}.csv", rows)
     write_latex(out / f"{FILE}.tex", shown, 3, f"{SCORE}. Mean over seeds, 95% t intervals over seeds and episodes.")
     page = render("compare.html", score=SCORE, sides=comparison.sides, tables=blocks, file=FILE)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import matplotlib as mpl
@@ -50,18 +50,14 @@ MANY = 300
 """Number of dots above which a figure's dots are rasterised."""
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A figure and its description."""
+class Plot(NamedTuple):
+    """A figure, its data as in its CSV file, the base name of its files, and alternative text in words."""
 
     name: str
-    """Base name of its files."""
     caption: str
     words: str
-    """Alternative text for readers who cannot see it."""
     figure: Figure
     rows: pd.DataFrame
-    """Its data, as in its CSV file."""
 
 
 def looks_of(names: Iterable[str]) -> dict[str, int]:
@@ -73,21 +69,14 @@ def looks_of(names: Iterable[str]) -> dict[str, int]:
 def style(number: int) -> dict[str, Any]:
     """Line and marker style of a number."""
     turn = number // len(COLOURS)
-    return {
-        "color": COLOURS[number % len(COLOURS)],
-        "linestyle": DASHES[turn % len(DASHES)],
-        "marker": MARKERS[turn % len(MARKERS)],
-        "markersize": 4,
-    }
+    line = {"linestyle": DASHES[turn % len(DASHES)], "marker": MARKERS[turn % len(MARKERS)], "markersize": 4}
+    return {"color": COLOURS[number % len(COLOURS)]} | line
 
 
 def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, heights: Sequence[float] = ()) -> Figure:
-    """A figure with one titled panel per entry, filled row by row, and a shared legend below.
+    """A figure with one panel per entry (title, rows, and what draws them), and a shared legend below.
 
-    Args:
-        panels: title, rows, and the function that draws them.
-        columns: maximum panels per row.
-        heights: of each panel, in inches.
+    At most `columns` panels are in a row; `heights` of panels are in inches.
     """
     columns = min(columns, len(panels))
     sizes = list(heights) or [HEIGHT] * len(panels)
@@ -112,11 +101,9 @@ def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, he
     for axes in figure.axes:
         entries |= {name: handle for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     if entries:
-        names = sorted(entries)
+        names, form = sorted(entries), {"ncols": 4, "frameon": False, "fontsize": 8}
         figure.set_figheight(figure.get_figheight() + 0.24 * ceil(len(names) / 4) + 0.2)
-        figure.legend(
-            [entries[name] for name in names], names, loc="outside lower center", ncols=4, frameon=False, fontsize=8
-        )
+        figure.legend([entries[name] for name in names], names, loc="outside lower center", **form)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # freeze the layout instead of recomputing it for each file
     return figure
@@ -171,13 +158,8 @@ def draw_plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list
     finished = [run for run in runs if run.finished and run.result.losses]
     losses = tables.losses([(run.named, run.result.losses) for run in finished])
     looks = looks_of(name for table in (made["summary"], made["curves"], losses) for name in labels(table))
-    data = {
-        (row["task"], row["quality"]): row["data_return"] / TASKS[row["task"]].score_divisor
-        for row in made["gates"].to_dict("records")
-        if pd.notna(row["data_return"]) and row["task"] in TASKS
-    }
     return {
-        "scores": bar_plots(made["summary"], made["runs"], data, looks),
+        "scores": bar_plots(made["summary"], made["runs"], made["gates"], looks),
         "profiles": profile_plots(made["profiles"], made["aggregate"], looks),
         "lead": lead_plots(made["lead"]),
         "curves": curve_plots(made["curves"], looks),
@@ -202,24 +184,21 @@ def _by_label(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def _told(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 1) -> str:
     """A figure's content in words: the last value of each method."""
-    return "; ".join(
-        f"{title}: "
-        + ", ".join(f"{name} {mine[value].iloc[-1]:.{digits}f}" for name, mine in _by_label(rows[rows[value].notna()]))
-        for title, rows in places
-    )
+    known = [(title, _by_label(rows[rows[value].notna()])) for title, rows in places]
+    told = ((title, (f"{name} {rows[value].iloc[-1]:.{digits}f}" for name, rows in lines)) for title, lines in known)
+    return "; ".join(f"{title}: {', '.join(words)}" for title, words in told)
 
 
-def bar_plots(
-    summary: pd.DataFrame, runs: pd.DataFrame, data: Mapping[tuple[str, str], float], looks: dict[str, int]
-) -> list[Plot]:
-    """Final scores: one figure per corruption, one panel per task and quality, one bar per method.
+def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
+    """Final scores: one figure per corruption, one panel per task and quality, one bar per method, one dot per run.
 
-    Args:
-        summary: scores of every condition.
-        runs: table of runs; their final scores are drawn as dots.
-        data: the data's score by task and quality, shown in panel titles.
-        looks: style number of every label.
+    Titles have the data's score, which `gates` tell; `looks` is the style number of every label.
     """
+    titles = {}
+    for row in gates.to_dict("records"):
+        if pd.notna(row["data_return"]) and row["task"] in TASKS:
+            place, score = f"{row['task']} {row['quality']}", row["data_return"] / TASKS[row["task"]].score_divisor
+            titles[place] = f"{place} (data score {score:.1f})"
     seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table), kind="seed")
     dots = seeds.groupby([*SETTING, "label"])["score"].agg(list).to_dict()
 
@@ -243,10 +222,6 @@ def bar_plots(
         if axes.dataLim.x0 >= 0:
             axes.set_xlim(left=0)
 
-    def title(place: str, rows: pd.DataFrame) -> str:
-        known = data.get((rows["task"].iloc[0], rows["quality"].iloc[0]))
-        return place if known is None else f"{place} (data score {known:.1f})"
-
     def shown(rows: pd.DataFrame) -> pd.DataFrame:
         columns = ["kind", *SETTING, "label", "seed", "score", "low", "high", "seeds", "best_score", "missing"]
         both = pd.concat([rows.assign(kind="mean"), seeds[seeds["corruption"] == rows["corruption"].iloc[0]]])
@@ -258,7 +233,9 @@ def bar_plots(
         "seeds are missing, unfinished or diverged."
     )
     scored = summary[summary["score"].notna()]
-    return _plots(scored, "scores", caption, draw, "score", 2, title, shown, lambda rows: 0.3 + 0.2 * max(len(rows), 4))
+    return _plots(
+        scored, "scores", caption, draw, "score", 2, titles, shown, lambda rows: 0.3 + 0.2 * max(len(rows), 4)
+    )
 
 
 def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str, **more: Any) -> None:
@@ -304,14 +281,14 @@ def _plots(
     draw: Draw,
     value: str,
     columns: int = 3,
-    title: Callable[[str, pd.DataFrame], str] = lambda place, rows: place,
+    titles: Mapping[str, str] = {},
     shown: Callable[[pd.DataFrame], pd.DataFrame] = lambda rows: rows,
     height: Callable[[pd.DataFrame], float] = lambda rows: HEIGHT,
 ) -> list[Plot]:
     """One figure per corruption, one panel per task and quality."""
     plots = []
     for corruption, rows, places in _figures(table):
-        panels = [(title(place, members), members, draw) for place, members in places]
+        panels = [(titles.get(place, place), members, draw) for place, members in places]
         figure = sheet(panels, columns, [height(members) for _, members in places])
         told = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows['seeds'])}"
         plots.append(Plot(file_name(name, corruption), told, _told(places, value), figure, shown(rows)))
@@ -390,34 +367,30 @@ DOTS = {
 
 def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot]:
     """Return over probe errors or action errors: one dot per run, two panels per setting."""
-    measures, axis, words = DOTS[name]
+    measures, axis, told = DOTS[name]
 
-    def draw_against(column: str, many: bool) -> Draw:
-        def draw(axes: Axes, rows: pd.DataFrame) -> None:
-            for label, mine in _by_label(rows[rows[column].notna()]):
-                look = style(looks[label])
-                marks = {"marker": look["marker"], "ec": "white", "lw": 0.5, "rasterized": many}
-                axes.scatter(mine[column], mine["return"], 26, look["color"], label=plain(label, NAME_WIDTH), **marks)
-            axes.set(xlabel=axis, ylabel="return")
-            axes.update_datalim([(0, 0)])
-            axes.autoscale_view()
-
-        return draw
+    def draw(column: str, many: bool, axes: Axes, rows: pd.DataFrame) -> None:
+        for label, mine in _by_label(rows[rows[column].notna()]):
+            look = style(looks[label])
+            marks = {"marker": look["marker"], "ec": "white", "lw": 0.5, "rasterized": many}
+            axes.scatter(mine[column], mine["return"], 26, look["color"], label=plain(label, NAME_WIDTH), **marks)
+        axes.set(xlabel=axis, ylabel="return")
+        axes.update_datalim([(0, 0)])
+        axes.autoscale_view()
 
     known = runs[runs["return"].notna() & runs[list(measures)].notna().any(axis=1)]
     plots = []
     for corruption, rows, places in _figures(known):
         panels = [
-            (f"{title}, {measures[column]}", members, draw_against(column, len(rows) > MANY))
+            (f"{title}, {words}", members, partial(draw, column, len(rows) > MANY))
             for title, members in places
-            for column in measures
+            for column, words in measures.items()
         ]
-        caption = f"Final return under {corruption} against {words}; further left is better. One dot a run, "
+        caption = f"Final return under {corruption} against {told}; further left is better. One dot a run, "
         caption += f"n = {len(rows)} runs."
         shown = rows[[*SETTING, "label", "seed", *measures, "return"]].rename(columns={"label": "method"})
-        figure = sheet(panels, 4 if len(places) > 1 else 2)
-        told = f"Returns: {_told(places, 'return', 0)}"
-        plots.append(Plot(file_name(name, corruption), caption, told, figure, shown))
+        words, figure = f"Returns: {_told(places, 'return', 0)}", sheet(panels, 4 if len(places) > 1 else 2)
+        plots.append(Plot(file_name(name, corruption), caption, words, figure, shown))
     return plots
 
 

@@ -17,7 +17,6 @@ from vd4rl_pomdp.runs.files import Row
 
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their number of dimensions."""
-
 STRIP_FRAMES = 8
 """Maximum frames in a film strip."""
 MOST_BYTES = 5 * 2**20
@@ -43,12 +42,12 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:
     """
     chosen: dict[tuple, Run] = {}
     for run in runs:
-        if run.rows and run.result.folder and (run.path / FILM_FILE).exists():
+        if run.rows and run.result.folder and (run.result.path / FILM_FILE).exists():
             chosen.setdefault(run.of(CONDITION), run)
     shown, size = [], 0
     for run in chosen.values():
-        film = read_film(run.path / FILM_FILE)
-        still, moving = (base64.b64encode(picture).decode() for picture in (strip(film), movie(film)))
+        film = read_film(run.result.path / FILM_FILE)
+        still, moving = (base64.b64encode(picture).decode() for picture in (_strip(film), _movie(film)))
         size += len(still) + len(moving)  # everything is embedded, as the page must open from disk
         if size > MOST_BYTES:
             break
@@ -57,7 +56,7 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:
     return shown, len(chosen) - len(shown)
 
 
-def strip(film: Film) -> bytes:
+def _strip(film: Film) -> bytes:
     """PNG film strip: clean frames above, the frames of the corrupted stacks (oldest to newest) below."""
     chosen = np.unique(np.linspace(0, len(film["clean"]) - 1, STRIP_FRAMES).astype(int))
     stacks = film["corrupted"][chosen].reshape(len(chosen), -1, 3, *film["corrupted"].shape[-2:])
@@ -70,7 +69,7 @@ def strip(film: Film) -> bytes:
     return buffer.getvalue()
 
 
-def movie(film: Film) -> bytes:
+def _movie(film: Film) -> bytes:
     """Animated WebP of an episode: clean frame on the left, newest corrupted frame on the right."""
     newest = film["corrupted"][:, -3:]
     pairs = np.concatenate([film["clean"], newest], axis=3).transpose(0, 2, 3, 1)
@@ -79,19 +78,15 @@ def movie(film: Film) -> bytes:
 
 
 def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
-    """Animated WebP of several agents in one episode, one row each: the scene, then the stack that the agent sees.
+    """Animated WebP of several agents in one episode, a named row each: the scene, then the stack that the agent sees.
 
-    Args:
-        names: titles of the rows.
-        films: one per row. Stacks are shown oldest frame first; an episode that ended early freezes.
+    Stacks are shown oldest frame first; an episode that ended early freezes.
     """
-    frames = [
-        np.concatenate(
-            [_row(name, film, min(shot, len(film["clean"]) - 1)) for name, film in zip(names, films, strict=True)]
-        )
-        for shot in range(max(len(film["clean"]) for film in films))
-    ]
-    return _webp([Image.fromarray(frame) for frame in frames], 70)
+    frames = []
+    for shot in range(max(len(film["clean"]) for film in films)):
+        rows = [_row(name, film, min(shot, len(film["clean"]) - 1)) for name, film in zip(names, films, strict=True)]
+        frames.append(Image.fromarray(np.concatenate(rows)))
+    return _webp(frames, 70)
 
 
 def _webp(frames: Sequence[Image.Image], quality: int) -> bytes:

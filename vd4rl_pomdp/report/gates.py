@@ -1,17 +1,24 @@
-"""Gates that a setting must pass before its methods are ranked.
+"""Gates that a setting must pass before its methods are ranked, and the paper's claims, judged on returns.
 
-1. The data must suffice for the algorithm, both with the state known (`state`) and with nothing hidden (`acro` under
-   `none`, relative to published results from pixels).
-2. Under the corruption, some method must beat an untrained encoder (`random`).
-3. The critics of all these runs must have converged.
+Gates: 1. The data must suffice for the algorithm, both with the state known (`state`) and with nothing hidden (`acro`
+under `none`, relative to published results from pixels). 2. Under the corruption, some method must beat an untrained
+encoder (`random`). 3. The critics of all these runs must have converged. If a gate fails, differences in return reflect
+the data, the algorithm and their budget more than the representations.
 
-If a gate fails, differences in return reflect the data, the algorithm and their budget more than the representations.
-The three reference methods are used without variants, and only runs with equal settings are compared.
+Claims: the text and two figures of Wu et al. (arXiv 2404.14552, Section 4.2) claim that baselines fail considerably
+under partial observability, that a history and then past actions improve on them, and that MIK+A leads in almost all
+tasks. Two distances are reported besides: to a memory supervised with states, and to the states themselves. Claims of a
+family (results/protocol.md names two) are tested together: Holm's method adjusts their p values over the family's
+claims measured in a setting. All others are exploratory and judged individually.
+
+Named methods are used without variants, and only runs with equal settings are compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,20 +26,8 @@ import numpy as np
 from vd4rl_pomdp.core.errors import told_apart
 from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.data.folder import published_scores
-from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.load import (
-    DATA,
-    ENCODER_SEED,
-    PLAIN,
-    PRESETS,
-    REFERENCES,
-    SETTING,
-    STATE,
-    Run,
-    a_set_a_seed,
-    of_corruption,
-)
-from vd4rl_pomdp.report.stats import interval
+from vd4rl_pomdp.report import load, stats
+from vd4rl_pomdp.report.load import REFERENCES, SETTING, STATE, Run, label
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words
 
@@ -46,6 +41,16 @@ BASELINES = {"bc": "BC", "drq_bc": "DrQ+BC"}
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
 NOT_RECORDED = "convergence is not recorded"
 GATED = (*SETTING, "algorithm")
+_place = itemgetter(*GATED)
+HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
+NOT_REFUTED = "not refuted"
+"""Verdict of an undecided "not below" claim."""
+PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
+DISTANCE = "distance"
+"""Kind of a row that is a measurement, not a claim."""
+LEADER, OTHER = "mik+a", "acro"
+OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}
+"""What the leader is compared with, by the difference's name: the other method's `--history`."""
 
 
 class Sides(NamedTuple):
@@ -67,22 +72,84 @@ def gates(runs: list[Run]) -> list[Row]:
     whether the critics of all these runs did. Unknown values are None.
     """
     finished = comparable(runs)
-    return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
+    return [_gate(key, on_set(key, finished)) for key in sorted({run.of(GATED) for run in finished})]
+
+
+def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
+    here, clean = (seen_under(under, runs) for under in (key[2], "none"))
+    state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
+    learned, floor = [run for run in here if run.method not in REFERENCES], as_it_is("random", here)
+    compared = sides(learned, floor)
+    above, (low, high) = difference(compared)
+    data = {value for run in here if (value := run.reference.data_return) is not None}
+    everyone = {"state": state, "acro under none": acro, "best": compared.left, "random": compared.right}
+    bar, source = pixel_bar(key[0], key[1], [run.reference.data_return for run in acro or here])
+    row: Row = dict(zip(GATED, key, strict=True)) | {
+        "data_return": float(np.mean(sorted(data))) if data else None,
+        **{"state_share": _share(state), "state_seeds": len(state)},
+        **{"acro_share": _share(acro), "acro_seeds": len(acro), "acro_bar": bar, "bar_from": source},
+        **{"best_share": _share(compared.left), "above_random": above, "low": low, "high": high},
+        "converged": converged(run for seeds in everyone.values() for run in seeds),
+    }
+    missed, unknown = [], []
+    for words, share, least in (
+        ("state", row["state_share"], STATE_SHARE),
+        ("acro under none", row["acro_share"], bar),
+    ):
+        if not everyone[words]:
+            unknown.append(f"{words} was not measured")
+        elif share is None or least is None:  # without a bar there is no share either
+            told = all(run.reference.data_return is not None for run in everyone[words])
+            unknown.append(f"the data's return is {'not above 0' if told else 'not known'}")
+        elif share < least:
+            found, asked = told_apart(share, least, 2)
+            missed.append(f"{words} returns {found} of the data's return, less than {asked}")
+    if compared.unlike:
+        unknown.append(f"best and random have other {', '.join(compared.unlike)}")
+    elif not floor or not learned:
+        unknown.append("no method but references was measured" if floor else "random was not measured")
+    elif low is None:
+        unknown.append("best and random need two seeds each that differ")
+    elif low <= 0:
+        missed.append(f"best minus random is {above:.0f} {stats.interval(low, high, 0)}")
+    if row["converged"] is None:
+        unknown.append(NOT_RECORDED)
+    if still := [name for name, seeds in everyone.items() if converged(seeds) is False]:
+        missed.append(f"critics had not converged ({', '.join(still)})")
+    if missed:  # one failed gate suffices, whatever is unknown about the others
+        return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
+    return row | {"verdict": f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED}
+
+
+def pixel_bar(task: str, quality: str, data: Sequence[float | None]) -> tuple[float | None, str]:
+    """Minimum return of `acro` under `none`, as a fraction of its data's return, and the published score behind it.
+
+    `data` is the mean return of each judged run's data. Unless all are known and above 0, there is no minimum.
+    """
+    scores = [row for row in published_scores() if (row["env"], row["dataset"]) == (task, quality)]
+    if not scores:
+        return ACRO_SHARE, "none published"
+    score, name = max((float(scores[0][column]), name) for column, name in BASELINES.items())
+    # Published returns exceed ours on some datasets: there, matching our own data's return is enough.
+    shares = [min(1.0, 10 * score / value) for value in data if value is not None and value > 0]
+    known = bool(shares) and len(shares) == len(data)
+    return PUBLISHED_SHARE * float(np.mean(shares)) if known else None, f"{name} {score:g}"
 
 
 def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple[str, ...], str]:
-    """By setting with an evaluated run, what certificates say about the need for memory, for each of its datasets.
-
-    Args:
-        runs: runs of a report.
-        certificates: by id.
-    """
+    """By setting with an evaluated run, what `certificates`, by id, say about the need for memory for its datasets."""
     found = {}
     for place, mine in groups((run for run in runs if run.rows), lambda run: run.of(SETTING)).items():
         names = dict.fromkeys(run.result.certificate for run in mine)
         told = (certificate_in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
         found[place] = "; ".join(dict.fromkeys(told))
     return found
+
+
+def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
+    """Undecided settings: values of some columns for which all rows fail a gate."""
+    places = groups(table, itemgetter(*names))
+    return {place for place, rows in places.items() if all(row["verdict"].startswith(FAILED) for row in rows)}
 
 
 def comparable(runs: Iterable[Run]) -> list[Run]:
@@ -94,84 +161,6 @@ def on_set(place: tuple[str, ...], runs: Iterable[Run]) -> list[Run]:
     """Runs with a row's task, quality and algorithm, under any corruption."""
     task, quality, _, algorithm = place
     return [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
-
-
-def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
-    """Undecided settings: values of some columns for which all rows fail a gate."""
-    places = groups(table, lambda row: tuple(row[name] for name in names))
-    return {place for place, rows in places.items() if all(row["verdict"].startswith(FAILED) for row in rows)}
-
-
-def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
-    alike = on_set(key, runs)
-    here, clean = (seen_under(under, alike) for under in (key[2], "none"))
-    state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
-    learned = [run for run in here if run.method not in REFERENCES]
-    floor = as_it_is("random", here)
-    compared = sides(learned, floor)
-    above, (low, high) = difference(compared)
-    data = {value for run in here if (value := run.reference.data_return) is not None}
-    everyone = {"state": state, "acro under none": acro, "best": compared.left, "random": compared.right}
-    bar, source = pixel_bar(key[0], key[1], [run.reference.data_return for run in acro or here])
-    row: Row = dict(zip(GATED, key, strict=True)) | {
-        "data_return": float(np.mean(sorted(data))) if data else None,
-        "state_share": _share(state),
-        "state_seeds": len(state),
-        "acro_share": _share(acro),
-        "acro_seeds": len(acro),
-        "acro_bar": bar,
-        "bar_from": source,
-        "best_share": _share(compared.left),
-        **{"above_random": above, "low": low, "high": high},
-        "converged": converged(run for runs in everyone.values() for run in runs),
-    }
-    missed, unknown = [], []
-    for name, least, words, reference in (
-        ("state_share", STATE_SHARE, "state", state),
-        ("acro_share", row["acro_bar"], "acro under none", acro),
-    ):
-        if not reference:
-            unknown.append(f"{words} was not measured")
-        elif row[name] is None:
-            told = all(run.reference.data_return is not None for run in reference)
-            unknown.append(f"the data's return is {'not above 0' if told else 'not known'}")
-        elif row[name] < least:
-            share, asked = told_apart(row[name], least, 2)
-            missed.append(f"{words} returns {share} of the data's return, less than {asked}")
-    if compared.unlike:
-        unknown.append(f"best and random have other {', '.join(compared.unlike)}")
-    elif not floor or not learned:
-        unknown.append("no method but references was measured" if floor else "random was not measured")
-    elif row["low"] is None:
-        unknown.append("best and random need two seeds each that differ")
-    elif row["low"] <= 0:
-        missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
-    if row["converged"] is None:
-        unknown.append(NOT_RECORDED)
-    if still := [name for name, mine in everyone.items() if converged(mine) is False]:
-        missed.append(f"critics had not converged ({', '.join(still)})")
-    if missed:  # one failed gate suffices, whatever is unknown about the others
-        return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
-    return row | {"verdict": f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED}
-
-
-def pixel_bar(task: str, quality: str, data: Sequence[float | None]) -> tuple[float | None, str]:
-    """Minimum return of `acro` under `none`, as a fraction of its data's return, and the published score behind it.
-
-    Args:
-        task: the dataset's task.
-        quality: the dataset's quality.
-        data: mean return of each judged run's data. Unless all are known and above 0, there is no minimum.
-    """
-    scores = [row for row in published_scores() if (row["env"], row["dataset"]) == (task, quality)]
-    if not scores:
-        return ACRO_SHARE, "none published"
-    score, name = max((float(scores[0][column]), name) for column, name in BASELINES.items())
-    returns = [value for value in data if value is not None and value > 0]
-    # Published returns exceed ours on some datasets: there, matching our own data's return is enough.
-    shares = [min(1.0, 10 * score / value) for value in returns]
-    known = bool(returns) and len(returns) == len(data)
-    return PUBLISHED_SHARE * float(np.mean(shares)) if known else None, f"{name} {score:g}"
 
 
 def converged(runs: Iterable[Run]) -> bool | None:
@@ -192,9 +181,8 @@ def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
 
 def as_it_is(method: str, runs: Iterable[Run], history: str = "method") -> list[Run]:
     """Runs of a method without variants other than its history. Unrecorded settings count as plain."""
-    plain = (PLAIN | {"history": history}).items()
-    mine = [run for run in runs if run.method == method]
-    return [run for run in mine if all(run.settings.get(name, PLAIN[name]) == value for name, value in plain)]
+    plain, mine = (load.PLAIN | {"history": history}).items(), [run for run in runs if run.method == method]
+    return [run for run in mine if all(run.settings.get(name, load.PLAIN[name]) == value for name, value in plain)]
 
 
 def best_of(runs: Iterable[Run]) -> list[Run]:
@@ -218,7 +206,7 @@ def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
 
 def seeds_by_variant(runs: Iterable[Run]) -> list[list[Run]]:
     """Seeds by method and variant. Seeds that share an encoder are left out: their spread is not a method's."""
-    own = (run for run in runs if ENCODER_SEED not in run.settings)
+    own = (run for run in runs if load.ENCODER_SEED not in run.settings)
     return list(groups(own, lambda run: run.of(("method", "variant"))).values())
 
 
@@ -234,16 +222,17 @@ def _unlike(left: list[Run], right: list[Run]) -> list[str]:
     For methods without pretraining, only fine-tuning settings count. If every training seed has its own dataset,
     datasets count as equal.
     """
-    one, other = left[0], right[0]
-    names = (one.settings.keys() & other.settings.keys()) - PLAIN.keys() - of_corruption(one.settings).keys()
+    one, other, data = left[0], right[0], load.DATA[0]
+    names = (one.settings.keys() & other.settings.keys()) - load.PLAIN.keys() - load.of_corruption(one.settings).keys()
     for run in (one, other):
         if run.method in ("random", STATE):
-            names &= settings_of(run.record["config"]).keys() | {DATA[0]}
-    found = [name for name in one.settings if name in names - {DATA[0]} and one.settings[name] != other.settings[name]]
-    sets = {run.settings.get(DATA[0]) for run in (*left, *right)}
-    if DATA[0] in names and len(sets) > 1 and not a_set_a_seed([*left, *right]):
-        found.append(DATA[0])
-    return [name for name in found if name in PRESETS] or found  # a preset stands for the settings that it determines
+            names &= settings_of(run.record["config"]).keys() | {data}
+    found = [name for name in one.settings if name in names - {data} and one.settings[name] != other.settings[name]]
+    both = [*left, *right]
+    if data in names and len({run.settings.get(data) for run in both}) > 1 and not load.a_set_a_seed(both):
+        found.append(data)
+    # a preset stands for the settings that it determines
+    return [name for name in found if name in load.PRESETS] or found
 
 
 def returns_of(runs: list[Run]) -> np.ndarray:
@@ -271,6 +260,186 @@ def difference(compared: Sides, clean: bool = False) -> tuple[float | None, tupl
 
 def _share(runs: list[Run]) -> float | None:
     """Mean return as a fraction of each run's own data return; None without runs or if a data return is not above 0."""
-    data = [run.reference.data_return for run in runs]
-    known = [value for value in data if value is not None and value > 0]
+    known = [value for run in runs if (value := run.reference.data_return) is not None and value > 0]
     return float((returns_of(runs) / known).mean()) if runs and len(known) == len(runs) else None
+
+
+class Contender(NamedTuple):
+    """The runs on one side of a claim."""
+
+    method: str = ""
+    """A method; empty: every method except the other side's."""
+    history: str = "method"
+    """Its `--history`."""
+    clean: bool = False
+    """Whether to take runs without corruption, whatever the setting hides."""
+
+
+class ReturnClaim(NamedTuple):
+    """A claim that the left side returns more than the right."""
+
+    text: str
+    left: Contender
+    right: Contender
+    hidden: bool = True
+    """True: for settings with a corruption; False: for settings without."""
+    kind: str = "above"
+    """above; not below (refuted if the left side is below); or distance, which is no claim."""
+    family: str = EXPLORATORY
+    """Claims that it is tested together with; exploratory: none."""
+
+
+_MIK_A, _MIK, _ACRO = Contender("mik+a"), Contender("mik"), Contender("acro")
+CLAIMS = (
+    ReturnClaim("acro returns less where pixels are hidden", Contender("acro", clean=True), _ACRO),
+    ReturnClaim("a memory pays: mik above acro", _MIK, _ACRO, family=PRIMARY),
+    ReturnClaim("a memory pays: acro with a GRU above acro", Contender("acro", "gru"), _ACRO, family=PRIMARY),
+    ReturnClaim("past actions pay: mik+a above mik", _MIK_A, _MIK, family=PRIMARY),
+    ReturnClaim("both pay: mik+a above acro", _MIK_A, _ACRO, family=PRIMARY),
+    ReturnClaim("mik+a above ah+a", _MIK_A, Contender("ah+a"), family=SECOND),
+    ReturnClaim("mik+a above fj+a", _MIK_A, Contender("fj+a"), family=SECOND),
+    ReturnClaim("mik+a is above every other method", _MIK_A, Contender()),
+    ReturnClaim("with nothing hidden, mik+a is not below acro", _MIK_A, _ACRO, hidden=False, kind="not below"),
+    ReturnClaim("what is left to a memory that was told the states", Contender("supervised+a"), _MIK_A, kind=DISTANCE),
+    ReturnClaim("what is left to the states themselves", Contender("state", clean=True), _MIK_A, kind=DISTANCE),
+)
+
+
+def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
+    """One row with a `verdict` per claim and setting in which both sides have finished runs.
+
+    `difference` is the left side's mean return minus the right's, `low` and `high` its 95% interval, `p` its two-sided
+    p value; columns with `clean_` are the same without corruption. A claim of a family is judged by `adjusted_p`, an
+    exploratory one by `p`. `smallest` is the difference that a 5% test with this standard error detects with 80% power;
+    `smallest_share` is the same as a fraction of the data's return. If the sides have no runs with equal settings,
+    these are None and the verdict names the differences. Nothing is judged unless the critics of both sides are known
+    to have converged, nor in settings that are `unranked`.
+    """
+    finished = comparable(runs)
+    places = sorted({run.of(GATED) for run in finished})
+    found = [one for claim in CLAIMS for place in places if (one := _compared(claim, place, finished)) is not None]
+    tested = (row for row, _ in found if row["family"] in (PRIMARY, SECOND) and row["p"] is not None)
+    for family in groups(tested, lambda row: (row["family"], *_place(row))).values():
+        for row, adjusted in zip(family, stats.holm([row["p"] for row in family]), strict=True):
+            row["adjusted_p"] = adjusted
+    return [row | {"verdict": _verdict(row, compared, _place(row) in unranked)} for row, compared in found]
+
+
+def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tuple[Row, Sides] | None:
+    """A claim in a setting, not judged yet, and its comparison; None if a side has no run."""
+    if claim.hidden == (place[2] == "none"):
+        return None
+    alike, chosen = on_set(place, runs), []
+    for side, other in ((claim.left, claim.right), (claim.right, claim.left)):
+        seen = seen_under("none" if side.clean else place[2], alike)
+        others = [run for run in seen if run.method not in (other.method, *REFERENCES)]
+        chosen.append(as_it_is(side.method, seen, side.history) if side.method else others)
+    compared = sides(*chosen) if claim.right.method else _decisive(*chosen)
+    if not compared.left:
+        return None
+    row: Row = {"claim": claim.text, "kind": claim.kind, "family": "" if claim.kind == DISTANCE else claim.family}
+    row |= dict(zip(GATED, place, strict=True))
+    for name, seeds in (("left", compared.left), ("right", compared.right)):
+        row |= {name: label(seeds[0].named), f"{name}_return": float(returns_of(seeds).mean())}
+        row[f"{name}_seeds"] = len(seeds)
+    for prefix in ("", "clean_"):
+        above, (low, high) = difference(compared, clean=bool(prefix))
+        row |= {f"{prefix}difference": above, f"{prefix}low": low, f"{prefix}high": high}
+    found = None if compared.unlike else stats.difference(episodes_of(compared.left), episodes_of(compared.right))
+    data = [run.reference.data_return for run in (*compared.left, *compared.right)]
+    mean = None if None in data else float(np.mean(data))  # type: ignore[arg-type]
+    smallest = found and found.smallest
+    row |= {"p": found and found.p, "adjusted_p": None, "smallest": smallest, "data_return": mean}
+    row["smallest_share"] = smallest / mean if smallest and mean and mean > 0 else None
+    return row, compared
+
+
+def _decisive(left: list[Run], others: list[Run]) -> Sides:
+    """The comparison that decides a claim about every other method, since it must hold against each of them.
+
+    Among other methods and variants: the one with the highest return of those that refute the claim, else of those that
+    leave it open, however few seeds they have.
+    """
+    pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
+    alike = [pair for pair in pairs if not pair.unlike]
+    ends = [difference(pair)[1] for pair in alike]
+    refuted = [pair for pair, (_, high) in zip(alike, ends, strict=True) if high is not None and high < 0]
+    shown = [low is not None and low > 0 for low, _ in ends]
+    doubted = [pair for pair, above in zip(alike, shown, strict=True) if not above or not converged(pair.right)]
+    # The best other method alone is not enough: a weaker one with a single seed may leave the claim open.
+    decisive = refuted or doubted or alike or pairs
+    return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
+
+
+def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
+    if compared.unlike:
+        return f"not judged: other {', '.join(compared.unlike)}"
+    if row["kind"] == DISTANCE:
+        return ""
+    settled = converged([*compared.left, *compared.right])
+    if unranked or not settled:
+        return f"not judged: {NOT_RECORDED if settled is None and not unranked else FAILED}"
+    p = row["p"] if row["adjusted_p"] is None else row["adjusted_p"]
+    sign = HOLDS if row["difference"] > 0 else FAILS
+    found = FEW if p is None else sign if p < stats.LEVEL else OPEN
+    return NOT_REFUTED if found == OPEN and row["kind"] == "not below" else found
+
+
+def tally(rows: list[Row]) -> str:
+    """Summary of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
+    if rows[0]["kind"] == DISTANCE:
+        return ""
+    counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
+    held = f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"
+    return "; ".join([held, *(f"{verdict} in {count}" for verdict, count in counts.items())])
+
+
+def leads(runs: list[Run]) -> list[Row]:
+    """How the leader's lead depends on pretraining: a row per setting, policy budget, difference, pretraining budget.
+
+    Only where both methods have at least two pretraining budgets, with a run each. `difference` is the leader's mean
+    return minus the other method's, each run's in % of its own data's mean return; `low` and `high` bound its 95%
+    interval over seeds and episodes. Only runs with equal settings are compared; without any it is None. `left_seeds`
+    and `right_seeds` count both sides' seeds, comparable or not.
+
+    A policy's budget is its `updates` and hidden `units`; a pretraining's is its `steps` and frame `stacks` per batch.
+    """
+    finished = [run for run in comparable(runs) if (run.reference.data_return or 0) > 0]
+    sides_of = [as_it_is(LEADER, finished), *(as_it_is(OTHER, finished, history) for history in OTHERS.values())]
+    known = []
+    for run in (run for side in sides_of for run in side):
+        own, card = run.record["config"], run.result.card
+        before = card.get("settings") or {}
+        if {"updates", "hidden_dim"} <= own.keys() and "steps" in card and {"batch_size", "window"} <= before.keys():
+            pretraining = card["steps"], before["batch_size"] * before["window"]
+            known.append((run, (own["updates"], own["hidden_dim"]), pretraining))
+    rows: list[Row] = []
+    for (place, (updates, units)), here in sorted(groups(known, lambda one: (one[0].of(GATED), one[1])).items()):
+        by_budget, everyone = groups(here, itemgetter(2)), [run for run, *_ in here]
+        for name, history in OTHERS.items():
+            if len(by_budget) < 2 or not (as_it_is(LEADER, everyone) and as_it_is(OTHER, everyone, history)):
+                continue
+            for steps, stacks in sorted(by_budget, key=math.prod):
+                row = dict(zip(GATED, place, strict=True)) | {"method": name, "variant": "", "updates": updates}
+                row |= {"units": units, "steps": steps, "stacks": stacks}
+                rows.append(row | _lead([run for run, *_ in by_budget[steps, stacks]], history))
+    if len({(row["updates"], row["units"]) for row in rows}) > 1:
+        for row in rows:
+            row["variant"] = f"{row['updates']:,} updates of {row['units']:,} units"
+    return rows
+
+
+def _lead(runs: list[Run], history: str) -> Row:
+    """The difference among runs of one budget."""
+    both = as_it_is(LEADER, runs), as_it_is(OTHER, runs, history)
+    compared = sides(*both)
+    row: Row = dict.fromkeys(("difference", "low", "high", "seeds"))
+    if compared.left and not compared.unlike:
+        both = compared.left, compared.right
+        data = (np.array([[run.reference.data_return] for run in side], dtype=float) for side in both)
+        left, right = (100 * episodes_of(side) / known for side, known in zip(both, data, strict=True))
+        row["low"], row["high"] = stats.difference_interval(left, right) or (None, None)
+        row["difference"] = float(left.mean() - right.mean())
+    seeds = [len({run.labels["seed"] for run in side}) for side in both]
+    row["seeds"] = 0 if row["difference"] is None else min(seeds)
+    return row | {"left_seeds": seeds[0], "right_seeds": seeds[1]}

@@ -1,7 +1,4 @@
-"""Loads runs for reports: one typed record per run, from which the frames of runs and of evaluations are built.
-
-Path of a number into a table: rows of `episodes.csv` (`runs.results`), a `Run`, `runs_frame` or `episodes_frame`, a
-group-by in `report.tables`.
+"""Loads runs for reports: one record per run, from which the frames of runs and of evaluations are built.
 
 Variants of a method are named by the settings that differ among its runs, e.g. "max_k 1" in "acro, max_k 1". Runs are
 seeds of one experiment only if they agree in everything except seed, folders, device and logging. A fine-tuning run's
@@ -58,9 +55,6 @@ REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, STATE)
 
 Settings = dict[str, str]
 """Values as text, by displayed name."""
-Parts = tuple[str, str]
-"""What differs among all runs of a method, and how data differ among its runs in one setting."""
-
 _UNSET = "unset"
 PRESETS = ("preset", "pretraining preset")
 DATA = ("data", "pretraining data")
@@ -127,13 +121,8 @@ class Run:
     """What its policy is compared with: data and behaviour policy."""
     measures: dict[str, float | None]
     """Encoder, critic and cost measures: action_loss, PROBES, CRITIC, COSTS; None if unknown."""
-    parts: Parts = ("", "")
-    """Settings that distinguish it from other runs of its method; see `Parts`."""
-
-    @property
-    def path(self) -> Path:
-        """Its folder, or the results folder that lists it."""
-        return self.result.path
+    parts: tuple[str, str] = ("", "")
+    """What differs among all runs of its method, and how data differ among those in its setting."""
 
     @property
     def record(self) -> Row:
@@ -188,8 +177,8 @@ class Run:
     @cached_property
     def last_clean(self) -> list[Row]:
         """Rows of its last evaluation under no corruption, whatever it was trained under; empty if there was none."""
-        end = {row["step"] for row in self.last}
-        return [row for row in self.result.rows if row["step"] in end and row["evaluated_under"] == "none"]
+        ends = {row["step"] for row in self.last}
+        return [row for row in self.result.rows if row["step"] in ends and row["evaluated_under"] == "none"]
 
     @property
     def finished(self) -> bool:
@@ -252,9 +241,9 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
     runs = _told_apart([_load(result) for result in choice.among(find_results(paths, but))])
     seen: dict[tuple[Any, ...], Path] = {}
     for run in runs:
-        other = seen.setdefault(run.of(IDENTITY), run.path) if run.rows else run.path
-        if other is not run.path:
-            raise UserError(f"{run.path} and {other}: two runs of one method, setting and seed; report one of them")
+        path = run.result.path
+        if run.rows and (other := seen.setdefault(run.of(IDENTITY), path)) is not path:
+            raise UserError(f"{path} and {other}: two runs of one method, setting and seed; report one of them")
     return runs
 
 
@@ -263,13 +252,10 @@ def _load(result: Result) -> Run:
     with damaged(result.place, *DAMAGED):
         probe, stored = result.files.get("probe", {}), result.files.get("reference")
         critic = result.files.get("critic", {})
-        told = {
-            "action_loss": result.encoder.get("action_loss"),
-            **{name: probe.get(name) for name in PROBES},
-            **{name: critic.get(key) for name, key in CRITIC.items()},
-            "pretrain_seconds": result.files.get("pretrain_timing", {}).get("seconds"),
-            "finetune_seconds": result.files["timing"]["seconds"] if result.finished else None,
-        }
+        told = {"action_loss": result.encoder.get("action_loss")} | {name: probe.get(name) for name in PROBES}
+        told |= {name: critic.get(key) for name, key in CRITIC.items()}
+        told["pretrain_seconds"] = result.files.get("pretrain_timing", {}).get("seconds")
+        told["finetune_seconds"] = result.files["timing"]["seconds"] if result.finished else None
         if wrong := [value for value in told.values() if value is not None and not isinstance(value, int | float)]:
             raise TypeError(f"{wrong[0]!r} is not a number")
         reference = Reference() if stored is None else Reference.parse(result.path / REFERENCE_FILE, stored)
@@ -284,13 +270,9 @@ def _told_apart(runs: list[Run]) -> list[Run]:
     # Corruption options are compared across all methods: equal corruptions must get equal names everywhere.
     hiding = without_sets([of_corruption(run.settings) for run in runs], sets, [""] * len(runs))
     own = without_sets([without(run.settings, of_corruption(run.settings)) for run in runs], sets, stages)
-    options = differences(
-        [{name.removeprefix(OF_CORRUPTION): value for name, value in one.items()} for one in hiding], names
-    )
-    corruptions = [
-        name if name == "none" else ", ".join(filter(None, (name, told)))
-        for name, told in zip(names, options, strict=True)
-    ]
+    options = [{name.removeprefix(OF_CORRUPTION): value for name, value in one.items()} for one in hiding]
+    told = zip(names, differences(options, names), strict=True)
+    corruptions = [name if name == "none" else ", ".join(filter(None, (name, what))) for name, what in told]
     of_methods = differences([without(one, DATA) for one in own], methods)
     # Different datasets always differ in fingerprint; only different contents of the same dataset matter.
     data = [{name: one[name] for name in DATA if name in one} for one in own]
@@ -310,9 +292,7 @@ def _told_apart(runs: list[Run]) -> list[Run]:
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
     """All settings of a run as text, with the prefix OF_CORRUPTION for those of its corruption.
 
-    Args:
-        record: its config.json.
-        card: its encoder's pretraining record; empty for a pretraining run or without an encoder.
+    Of its config.json and its encoder's pretraining record, which a pretraining run has none of.
     """
     own, hiding = settings_of(record["config"]), dict(card.get("corruption", {}))
     if record["stage"] == "pretrain":
@@ -343,10 +323,7 @@ def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, An
 def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
     """Drop settings that only vary with the dataset (equal within each, not across), e.g. a budget per task.
 
-    Args:
-        settings: of every run.
-        sets: task and quality of every run.
-        alike: grouping key of every run; groups are treated separately.
+    Of every run: its settings, its task and quality, and a key; runs of other keys are treated separately.
     """
     # A per-task budget is no ablation. As a variant it would split a method in two, with gaps on every other task.
     kept = [dict(one) for one in settings]
@@ -361,35 +338,30 @@ def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Seque
 
 
 def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list[str]:
-    """Per run, in words, the settings that differ within its group `alike`; "" without recorded settings."""
+    """Per run, in words, the settings that differ within its group `alike`: "max_k 1, steps 20"; "" if none are known.
+
+    Values in PLAIN are omitted. ENCODER_SEED is always shown, since nothing else reveals that seeds share an encoder.
+    A preset replaces the settings that it determines.
+    """
     words = [""] * len(settings)
     for places in groups((i for i, own in enumerate(settings) if own), alike.__getitem__).values():
-        for i, told in zip(places, _differences([settings[i] for i in places]), strict=True):
-            words[i] = told
+        here = [settings[i] for i in places]
+        names = [name for name in dict.fromkeys(name for one in here for name in one) if name != ENCODER_SEED]
+        columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in here] for name in names}
+        columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
+        # Options of a plug-in exist only with it, so naming the plug-in suffices.
+        everywhere = [name for name, column in columns.items() if _UNSET not in column]
+        columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
+        presets: list[str] = []
+        for name in PRESETS:
+            if name in columns and not _decided(name, columns, presets):
+                presets.append(name)
+        columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}
+        for row, (i, one) in enumerate(zip(places, here, strict=True)):
+            own = {name: column[row] for name, column in columns.items()}
+            own |= {name: value for name, value in one.items() if name == ENCODER_SEED}
+            words[i] = ", ".join(f"{name} {value}" for name, value in own.items() if value != PLAIN.get(name))
     return words
-
-
-def _differences(settings: Sequence[Settings]) -> list[str]:
-    """Per run, in words, the settings that differ among some runs: "max_k 1, steps 20". Values in PLAIN are omitted.
-
-    ENCODER_SEED is always shown, since nothing else reveals that seeds share an encoder. A preset replaces the settings
-    that it determines.
-    """
-    names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
-    columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in settings] for name in names}
-    columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
-    # Options of a plug-in exist only with it, so naming the plug-in suffices.
-    everywhere = [name for name, column in columns.items() if _UNSET not in column]
-    columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
-    presets: list[str] = []
-    for name in PRESETS:
-        if name in columns and not _decided(name, columns, presets):
-            presets.append(name)
-    columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}
-    told = [{name: column[i] for name, column in columns.items()} for i in range(len(settings))]
-    for own, one in zip(told, settings, strict=True):
-        own |= {name: value for name, value in one.items() if name == ENCODER_SEED}
-    return [", ".join(f"{name} {value}" for name, value in own.items() if value != PLAIN.get(name)) for own in told]
 
 
 def _decided(name: str, columns: Mapping[str, list[str]], by: Sequence[str]) -> bool:
@@ -420,41 +392,33 @@ def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
 
     `as_trained` marks episodes under the training corruption.
     """
-    rows = [
-        row | run.named | {"id": run.result.id, "as_trained": row["evaluated_under"] == row["corruption"]}
-        for run in runs
-        for row in run.result.rows
-    ]
+    rows = []
+    for run in runs:
+        own = run.named | {"id": run.result.id}
+        rows += [row | own | {"as_trained": row["evaluated_under"] == row["corruption"]} for row in run.result.rows]
     columns = ["id", *IDENTITY, *(name for name in COLUMNS if name not in IDENTITY), "as_trained"]
     return pd.DataFrame(rows, columns=columns).astype({"as_trained": bool})
 
 
 def runs_frame(runs: Iterable[Run]) -> pd.DataFrame:
     """One row per finished and evaluated run: encoder, scores, control, costs and provenance; None if unknown."""
-    table = pd.DataFrame([_run_row(run) for run in runs if run.evaluated], columns=[*IDENTITY, *_RUN])
-    return table.astype({name: float for name in _RUN if name not in _WORDS})
-
-
-_RUN = (
-    *("id", "action_loss", *PROBES, *ACTION_ERRORS, "score", "return", "best_score", "best_step"),
-    *("data_return", "share_above_80", *(f"clean_{name}" for name in CONTROL)),
-    *(*CRITIC, "converged", *COSTS, "git_commit", "machine", "state"),
-)
-_WORDS = ("id", "converged", "git_commit", "machine", "state")
-
-
-def _run_row(run: Run) -> Row:
-    by_step = groups(run.rows, lambda row: int(row["step"]))
-    scores = {step: np.mean([row["score"] for row in rows]) for step, rows in by_step.items()}
-    best = max(scores, key=scores.__getitem__)
-    row: Row = {"id": run.result.id, "state": run.progress, "machine": run.result.machine}
-    row |= {"git_commit": run.result.commit, "data_return": run.reference.data_return, "converged": run.converged}
-    row |= {"score": scores[max(scores)], "best_score": scores[best], "best_step": best}
-    row |= run.named | run.measures | {"path_error": run.reference.path_error}
-    for prefix, episodes in (("", run.last), ("clean_", run.last_clean)):
-        summed = summarise(episodes, run.reference) if episodes else {}
-        row |= {prefix + name: summed.get(key) for name, key in CONTROL.items()}
-    return row
+    rows = []
+    for run in (run for run in runs if run.evaluated):
+        by_step = groups(run.rows, lambda row: int(row["step"]))
+        scores = {step: np.mean([row["score"] for row in episodes]) for step, episodes in by_step.items()}
+        best = max(scores, key=scores.__getitem__)
+        row: Row = {"id": run.result.id, "state": run.progress, "machine": run.result.machine}
+        row |= {"git_commit": run.result.commit, "data_return": run.reference.data_return, "converged": run.converged}
+        row |= {"score": scores[max(scores)], "best_score": scores[best], "best_step": best}
+        row |= run.named | run.measures | {"path_error": run.reference.path_error}
+        for prefix, episodes in (("", run.last), ("clean_", run.last_clean)):
+            summed = summarise(episodes, run.reference) if episodes else {}
+            row |= {prefix + name: summed.get(key) for name, key in CONTROL.items()}
+        rows.append(row)
+    numbers = ["action_loss", *PROBES, *ACTION_ERRORS, "score", "return", "best_score", "best_step", "data_return"]
+    numbers += ["share_above_80", *(f"clean_{name}" for name in CONTROL), *CRITIC]
+    columns = [*IDENTITY, "id", *numbers, "converged", *COSTS, "git_commit", "machine", "state"]
+    return pd.DataFrame(rows, columns=columns).astype(dict.fromkeys((*numbers, *COSTS), float))
 
 
 def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:

@@ -9,6 +9,7 @@ runs.jsonl, episodes.csv         the raw rows behind everything, see `vd4rl_pomd
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,32 +21,228 @@ from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, load, tables
-from vd4rl_pomdp.report.claims import judge_claims, leads, tally
-from vd4rl_pomdp.report.figures import Plot, draw_plots
+from vd4rl_pomdp.report.figures import Plot, draw_plots, seeds_note
 from vd4rl_pomdp.report.films import shown_films
-from vd4rl_pomdp.report.gates import gates, unranked, verdicts
-from vd4rl_pomdp.report.load import (
-    ALL,
-    CONDITION,
-    SETTING,
-    Choice,
-    Run,
-    a_set_a_seed,
-    find_gaps,
-    label,
-    load_runs,
-    title,
-)
-from vd4rl_pomdp.report.render import block, render, terminal, texts, write_latex
-from vd4rl_pomdp.report.shown import MARK, NOTES, SHOWN, WHOLE, Shown, claim_of, shown_tables, with_algorithm
-from vd4rl_pomdp.report.stats import FEW_SEEDS
+from vd4rl_pomdp.report.gates import gates, judge_claims, leads, tally, unranked, verdicts
+from vd4rl_pomdp.report.load import ALL, COSTS, PROBES, SETTING, Choice, Run, label, setting, title
+from vd4rl_pomdp.report.render import Block, Columns, block, render, terminal, texts, write_latex
+from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_certificates, refuse_loss, write_results
 
+MARK = "summary"
+"""The table that every report has; its file identifies a report's folder."""
+WIDEST = 6
+"""Maximum methods side by side in a matrix; further ones go below."""
+
+
 SEEDS = 12
 """Maximum seeds that are listed individually."""
+Tables = dict[str, pd.DataFrame]
+Shown = dict[str, tuple[pd.DataFrame, list[Block]]]
+Plots = dict[str, list[Plot]]
+
+
+def with_algorithm(row: Row) -> str:
+    """A setting in words, with the algorithm unless it is TD3+BC."""
+    return setting(row) + ("" if row["algorithm"] == "td3_bc" else f", {row['algorithm']}")
+
+
+def _count(row: Row) -> str:
+    return f"{int(row['seeds'])}" + "†" * (0 < row["seeds"] < FEW_SEEDS)
+
+
+def _span(row: Row, cost: str) -> str:
+    """Mean, minimum and maximum of seconds."""
+    low, high = row[f"{cost}_min"], row[f"{cost}_max"]
+    return number(row[cost], 0) + (f" ({low:.0f} – {high:.0f})" if low < high else "")
+
+
+def _chance(row: Row) -> str:
+    """A probability with its interval, or the number of wins if a single seed allows no probability."""
+    if pd.isna(row["probability"]):
+        return f"{row['wins']:g} of {row['pairs']}"
+    few = "†" if row["seeds"] < FEW_SEEDS else ""
+    return with_interval(row["probability"], row["low"], row["high"], 2) + few
+
+
+def claim_of(row: Row) -> str:
+    """A claim, with its family."""
+    return row["claim"] + (f" ({row['family']})" if row["family"] else "")
+
+
+def _p(row: Row) -> str:
+    """A p value, and the one adjusted for its family."""
+    if pd.isna(row["p"]):
+        return number(None)
+    told = "" if pd.isna(row["adjusted_p"]) else f" ({row['adjusted_p']:.3f})"
+    return f"{row['p']:.3f}{told}"
+
+
+def _smallest(row: Row) -> str:
+    """The smallest detectable difference, also as a percentage of the data's return."""
+    share = "" if pd.isna(row["smallest_share"]) else f" ({100 * row['smallest_share']:.0f}%)"
+    return number(row["smallest"], 0) + share
+
+
+SHOWN: dict[str, Columns] = {
+    "gates": {
+        "setting": with_algorithm,
+        "verdict": "verdict",
+        "memory": "memory",
+        "data's return": ("data_return", 0),
+        "state": ("state_share", 2),
+        "acro, none": ("acro_share", 2),
+        "its bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
+        "best": ("best_share", 2),
+        "best – random": ("above_random", "low", "high", 0),
+    },
+    "claims": {
+        "claim": claim_of,
+        "setting": setting,
+        "verdict": lambda row: row["verdict"] or "–",
+        "left": lambda row: f"{row['left']}: {row['left_return']:.0f} (n = {row['left_seeds']})",
+        "right": lambda row: f"{row['right']}: {row['right_return']:.0f} (n = {row['right_seeds']})",
+        "difference": ("difference", "low", "high", 0),
+        "p (Holm)": _p,
+        "would be found": _smallest,
+        "played clean": ("clean_difference", "clean_low", "clean_high", 0),
+    },
+    "lead": {
+        "setting": with_algorithm,
+        "difference": label,
+        "pretraining": lambda row: f"{row['steps']:,} x {row['stacks']}",
+        "% of the data's return": ("difference", "low", "high", 1),
+        "seeds": lambda row: f"{row['left_seeds']}, {row['right_seeds']}",
+    },
+    MARK: {
+        "setting": setting,
+        "method": label,
+        "last evaluation": ("score", "low", "high", 1),
+        "at update": ("step", 0),
+        "best evaluation": ("best_score", "best_low", "best_high", 1),
+        "its update": ("best_step", 0),
+        "seeds": _count,
+        "episodes": "episodes",
+        "not there": "missing",
+    },
+    "aggregate": {
+        "corruption": "corruption",
+        "method": label,
+        **{
+            name.replace("_", " ").replace("iqm", "IQM"): (name, f"{name}_low", f"{name}_high", 1)
+            for name in tables.AGGREGATES
+        },
+        "tasks": lambda row: f"{row['tasks']} of {row['of_tasks']}",
+        "seeds": _count,
+    },
+    "improvement": {"corruption": "corruption", "row beats column": "method", "other": "other", "chance": _chance},
+    "representations": {
+        "setting": setting,
+        "method": label,
+        "action loss": ("action_loss", 3),
+        "pose, %": (PROBES[0], 1),
+        "velocity, %": (PROBES[1], 1),
+        "return": ("return", 0),
+        "seeds": ("seeds", 0),
+        "not there": "missing",
+    },
+    "control": {
+        "setting": setting,
+        "method": label,
+        "data's return": ("data_return", 0),
+        "return": ("return", 0),
+        "return, clean": ("clean_return", 0),
+        "above 80%": ("share_above_80", 2),
+        "above 80%, clean": ("clean_share_above_80", 2),
+        "error on path": ("path_error", 4),
+        "in loop": ("action_error", 4),
+        "in loop, clean": ("clean_action_error", 4),
+        "seeds": ("seeds", 0),
+    },
+    "elsewhere": {
+        "setting": setting,
+        "method": label,
+        "played under": "evaluated_under",
+        "score": ("score", "low", "high", 1),
+        "seeds": _count,
+        "episodes": "episodes",
+    },
+    "critics": {
+        "setting": setting,
+        "method": label,
+        "critic's value": ("critic_value", 1),
+        "data's discounted return": ("data_value", 1),
+        "moved, %": lambda row: number(100 * row["critic_moved"]),
+        "converged": lambda row: (
+            "not recorded" if pd.isna(row["converged"]) else f"{row['converged']:.0f} of {row['seeds']}"
+        ),
+    },
+    "costs": {
+        "method": "method",
+        "machines": lambda row: row["machines"] or "not recorded",
+        "pretraining, s": lambda row: _span(row, COSTS[0]),
+        "fine-tuning, s": lambda row: _span(row, COSTS[1]),
+        "runs": "runs",
+    },
+}
+"""Columns of the page's tables. All tables except WHOLE are split by the values of their first column."""
+WORDS = {"gates": 3, "claims": 4, "lead": 3, "elsewhere": 2, "costs": 2}
+"""Number of text columns at the left, if not 1."""
+WHOLE = ("gates", "costs")
+NOTES = {
+    MARK: f"{tables.SCORE}. Mean over seeds, 95% t intervals over seeds and episodes.",
+    "aggregate": "Over all tasks and seeds, 95% stratified bootstrap intervals.",
+    "improvement": "Probability that a run of the row's method ends above one of the column's.",
+}
+
+
+def shown_tables(made: Tables) -> Shown:
+    """The page's tables, by the base name of their files: their texts, as in the LaTeX file, and as displayed."""
+    needed = {"control": ["data_return", "clean_return"], "critics": ["critic_value"]}  # else nothing new is told
+    found = {}
+    for name, columns in SHOWN.items():
+        rows = made[name]
+        rows = rows.iloc[:0] if name in needed and rows[needed[name]].isna().all(axis=None) else rows
+        table = texts(rows, columns)
+        found[name] = table, list(_blocks(name, table, rows))
+    return found
+
+
+def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame) -> Iterator[Block]:
+    """Split a table by its first column; comparisons of two methods become a matrix."""
+    words = WORDS.get(name, 1)
+    if name in WHOLE:
+        note = seeds_note(rows["runs"], "run") if name == "costs" else ""
+        yield from [block("", table, words, note)] if len(table) else []
+        return
+    for heading, part in table.groupby(table.columns[0], sort=False):
+        mine, shown = rows.loc[part.index], part.drop(columns=table.columns[0])
+        if name == "claims":
+            yield block(str(heading), shown, words, tally(mine.to_dict("records")))
+        elif name == "improvement":
+            order = list(dict.fromkeys(shown["row beats column"]))
+            matrix = shown.pivot(index="row beats column", columns="other", values="chance")
+            matrix = matrix.reindex(index=order, columns=order).fillna("no common task")
+            for one in order:
+                matrix.loc[one, one] = ""
+            for start in range(0, len(order), WIDEST):
+                columns = matrix.iloc[:, start : start + WIDEST].reset_index().rename_axis(columns=None)
+                yield block(str(heading), columns, words, seeds_note(mine["seeds"]))
+        else:
+            note = seeds_note(mine["seeds"])
+            told = " and ".join(method for method in dict.fromkeys(mine["method"]) if method in load.TOLD_STATES)
+            if name == "representations" and told:
+                # A linear probe trivially reads out what the encoder was trained to predict.
+                note += f" {told}: trained on the states of all episodes, those that the probe holds out, too, but for"
+                note += " --hold-out."
+            if name == MARK:
+                note += f" Memory: {mine['memory'].iloc[0]}."
+            if "not there" in shown and not shown["not there"].any():
+                shown = shown.drop(columns="not there")
+            yield block(str(heading), shown, words, note)
 
 
 class Report(NamedTuple):
@@ -73,16 +270,14 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
             this report lacks.
     """
     refuse_foreign(out, "report", f"{MARK}.csv", RUNS)
-    runs = load_runs(paths, out, choice)
+    runs = load.load_runs(paths, out, choice)
     results = [run.result for run in runs]
     refuse_loss(results, out)  # check early: drawing takes most of the time
     if all(run.stage == "navigation" for run in runs):
         raise UserError(f"{paths[0]}: holds no evaluated run; `vd4rl-pomdp navigation report` reports its mazes")
     certificates = certificates_of(results, paths, None if out in paths else out)
     made, judged, claimed = _tables(runs, choice, verdicts(runs, certificates))
-    shown = shown_tables(made)
-    plots = draw_plots(runs, made)
-    mixed = unlike(runs)
+    shown, plots, mixed = shown_tables(made), draw_plots(runs, made), unlike(runs)
     page = _page(runs, made, shown, plots, mixed, load_section(paths))
     with owned(out):
         refuse_loss(results, out)  # again: runs may have been added meanwhile
@@ -93,14 +288,12 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     return Report(out / "index.html", made[MARK], judged, claimed, mixed)
 
 
-def _tables(
-    runs: list[Run], choice: Choice, memory: dict[tuple[str, ...], str]
-) -> tuple[dict[str, pd.DataFrame], list[Row], list[Row]]:
+def _tables(runs: list[Run], choice: Choice, memory: dict[tuple, str]) -> tuple[Tables, list[Row], list[Row]]:
     """All tables of a report by name, as in its CSV files; and the rows of gates and claims."""
     evaluated = tables.evaluations(load.episodes_frame(runs))
     finished = load.episodes_frame(run for run in runs if run.finished)
     final = tables.evaluations(finished)
-    gaps = pd.DataFrame(find_gaps(runs, choice), columns=[*CONDITION, "seed", "state"])
+    gaps = pd.DataFrame(load.find_gaps(runs, choice), columns=[*load.CONDITION, "seed", "state"])
     judged = [row | {"memory": memory[tuple(row[name] for name in SETTING)]} for row in gates(runs)]
     claimed = judge_claims(runs, unranked(judged))
     summary = tables.summary(final, gaps, unranked(judged, SETTING))
@@ -127,14 +320,7 @@ def _tables(
     return made, judged, claimed
 
 
-def _page(
-    runs: list[Run],
-    made: dict[str, pd.DataFrame],
-    shown: dict[str, Shown],
-    plots: dict[str, list[Plot]],
-    mixed: list[str],
-    theory: str | None,
-) -> str:
+def _page(runs: list[Run], made: Tables, shown: Shown, plots: Plots, mixed: list[str], theory: str | None) -> str:
     sets = set(made[MARK][["task", "quality"]].itertuples(index=False, name=None))
     published = pd.DataFrame([row for row in published_scores() if (row["env"], row["dataset"]) in sets])
     films, left_out = shown_films(runs)
@@ -142,20 +328,11 @@ def _page(
         "page.html",
         score=tables.SCORE,
         finished=sum(run.finished for run in runs),
-        unfinished=[
-            (
-                f"{title(run)}, seed {run.labels['seed']}",
-                run.path,
-                (run.result.diverged or {}).get("message"),
-                run.progress,
-            )
-            for run in runs
-            if not run.finished
-        ],
+        unfinished=[(title(run), run) for run in runs if not run.finished],
         gaps=len(made["missing"]),
         rows=sum(len(run.result.rows) for run in runs),
         few=FEW_SEEDS,
-        tables={name: one.blocks for name, one in shown.items()},
+        tables={name: blocks for name, (_, blocks) in shown.items()},
         plots={name: [(plot, figures.to_svg(plot.figure)) for plot in group] for name, group in plots.items()},
         unlike=mixed,
         films=films,
@@ -166,7 +343,7 @@ def _page(
     )
 
 
-def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], plots: dict[str, list[Plot]]) -> None:
+def _write(out: Path, made: Tables, shown: Shown, plots: Plots) -> None:
     """Write every table as CSV and LaTeX, and every figure. Removes those of an earlier report that no longer exist."""
     folder = out / "figures"
     with disk_errors(out):
@@ -176,17 +353,17 @@ def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], pl
             figures.write_table(out / f"{name}.csv", table)
         else:
             (out / f"{name}.csv").unlink(missing_ok=True)
-    for name, (table, _, words) in shown.items():
+    for name, (table, _) in shown.items():
         if len(table):
-            write_latex(out / f"{name}.tex", table, words + (name not in WHOLE), NOTES.get(name, ""))
+            write_latex(out / f"{name}.tex", table, WORDS.get(name, 1) + (name not in WHOLE), NOTES.get(name, ""))
         else:
             (out / f"{name}.tex").unlink(missing_ok=True)
-    drawn = [plot for group in plots.values() for plot in group]
-    for plot in drawn:
+    drawn = {plot.name: plot for group in plots.values() for plot in group}
+    for plot in drawn.values():
         figures.save_plot(folder, plot)
     for path in folder.iterdir():
         of_report = path.suffix in (".csv", ".png", ".pdf") and path.stem.partition("_")[0] in plots
-        if of_report and path.stem not in {plot.name for plot in drawn}:
+        if of_report and path.stem not in drawn:
             path.unlink()
 
 
@@ -194,7 +371,7 @@ def unlike(runs: list[Run]) -> list[str]:
     """Sentences about compared runs that differ in a dataset's content or in a plug-in's code."""
     told: dict[str, dict[str, set[str]]] = {}
     played = [run for run in runs if run.stage == "finetune" and run.rows]
-    own = {name for name, mine in groups(played, lambda run: run.set_name).items() if a_set_a_seed(mine)}
+    own = {name for name, mine in groups(played, lambda run: run.set_name).items() if load.a_set_a_seed(mine)}
     for run in played:
         content = "" if run.set_name in own else str(run.record.get("inputs", {}).get("data", ""))[:12]
         states = {f"the set of {run.set_name} has {{}} contents": content}

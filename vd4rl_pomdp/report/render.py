@@ -21,13 +21,8 @@ SYMBOLS = {"→": r"$\rightarrow$", "†": r"\dag{}", "–": "--", "×": r"$\tim
 Columns = dict[str, str | tuple[str, int] | tuple[str, str, str, int] | Callable[[Row], str]]
 """Columns of a displayed table by title. Each shows a row's text, a number with a given number of digits, a number with
 its interval, or the result of a function."""
-
-_TEMPLATES = jinja2.Environment(
-    loader=jinja2.PackageLoader("vd4rl_pomdp.report", ""),
-    autoescape=True,
-    undefined=jinja2.StrictUndefined,
-    trim_blocks=True,
-)
+_LOADER = jinja2.PackageLoader("vd4rl_pomdp.report", "")
+_TEMPLATES = jinja2.Environment(loader=_LOADER, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
 
 
 def render(template: str, **values: Any) -> str:
@@ -37,18 +32,18 @@ def render(template: str, **values: Any) -> str:
 
 def texts(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
     """A table's displayed texts, with the index of its rows."""
-    shown = [{title: _text(row, what) for title, what in columns.items()} for row in rows.to_dict("records")]
+
+    def text(row: Row, what: Any) -> str:
+        if callable(what):
+            return one_line(what(row))
+        if isinstance(what, str):
+            return one_line(str(row[what]))
+        *names, digits = what
+        in_words: Callable[..., str] = number if len(names) == 1 else with_interval
+        return in_words(*(row[name] for name in names), digits)
+
+    shown = [{title: text(row, what) for title, what in columns.items()} for row in rows.to_dict("records")]
     return pd.DataFrame(shown, rows.index, columns=list(columns))
-
-
-def _text(row: Row, what: Any) -> str:
-    if callable(what):
-        return one_line(what(row))
-    if isinstance(what, str):
-        return one_line(str(row[what]))
-    *names, digits = what
-    in_words: Callable[..., str] = number if len(names) == 1 else with_interval
-    return in_words(*(row[name] for name in names), digits)
 
 
 class Block(NamedTuple):

@@ -32,11 +32,6 @@ Strata = list[np.ndarray]
 """Scores by seed, one (n_i,) array per task."""
 
 
-def mean(scores: np.ndarray) -> np.ndarray:
-    """Mean over the last axis."""
-    return scores.mean(-1)
-
-
 def iqm(scores: np.ndarray) -> np.ndarray:
     """Interquartile mean over the last axis: mean of the middle half, with fractional weights at the quartiles."""
     ordered = np.sort(scores, axis=-1)
@@ -59,21 +54,11 @@ def aggregates(strata: Strata) -> dict[str, Statistic]:
         """Median over tasks of each task's mean."""
         return np.median(np.stack([part.mean(-1) for part in np.split(scores, edges, axis=-1)], axis=-1), axis=-1)
 
-    return {"iqm": iqm, "median": median, "mean": mean, "optimality_gap": optimality_gap}
-
-
-def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """Fraction of runs (n,) above each threshold (k,)."""
-    return (scores[:, None] > thresholds).mean(0)
+    return {"iqm": iqm, "median": median, "mean": lambda scores: scores.mean(-1), "optimality_gap": optimality_gap}
 
 
 def probability_of_improvement(strata: Strata, others: Strata) -> float:
-    """Probability that a run beats a run of the others on the same task, averaged over tasks; ties count half.
-
-    Args:
-        strata: scores of one method, by task.
-        others: scores of another method on the same tasks, in the same order.
-    """
+    """Probability that a run beats one of another method on the same task, averaged over tasks; ties count half."""
     return float(np.mean([_wins(one, other).mean() for one, other in zip(strata, others, strict=True)]))
 
 
@@ -122,11 +107,8 @@ def mean_interval(scores: np.ndarray) -> Interval | None:
 
     Three seeds that happen to agree must not make the interval narrower than the episodes allow. So the squared
     standard errors of both levels are added, with Welch-Satterthwaite degrees of freedom. This approximates a bootstrap
-    of seeds and then episodes, corrected for few seeds.
-
-    Returns:
-        Lower and upper end; None for a single seed, or if all scores are equal, since that says nothing about the
-        spread over seeds.
+    of seeds and then episodes, corrected for few seeds. None for a single seed, or if all scores are equal, since that
+    says nothing about the spread over seeds.
     """
     found = _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])
     return found.interval if found else None
@@ -177,14 +159,7 @@ def bootstrap_intervals(
 ) -> dict[str, Interval | None]:
     """Percentile 95% intervals of statistics of all runs, by name; seeds are resampled within each task.
 
-    Args:
-        strata: scores by seed, one (n_i,) array per task.
-        statistics: functions of (replicates, runs) scores.
-        rng: source of the draws.
-        replicates: bootstrap samples.
-
-    Returns:
-        Lower and upper ends; None if a task has a single seed, whose spread is unknown.
+    `statistics` are functions of (replicates, runs) scores. None if a task has a single seed, whose spread is unknown.
     """
     if _single(strata):
         return dict.fromkeys(statistics)
@@ -207,18 +182,18 @@ def improvement_interval(
     return _ends(chances / len(strata))
 
 
-def profile_band(
+def performance_profile(
     strata: Strata, thresholds: np.ndarray, rng: np.random.Generator, replicates: int = REPLICATES
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pointwise 95% band of the performance profile of all runs, two (k,) arrays; None if a task has one seed."""
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Fraction of all runs above each threshold (k,), and its pointwise 95% band (2, k), unless a task has one seed."""
+    runs = np.concatenate(strata)
+    share = (runs[:, None] > thresholds).mean(0)
     if _single(strata):
-        return None
-    runs = sum(map(len, strata))
+        return share, None
     shares = np.zeros((replicates, len(thresholds)))
     for scores in strata:
-        shares += _shares(len(scores), rng, replicates) @ (scores[:, None] > thresholds) * (len(scores) / runs)
-    low, high = np.percentile(shares, _LEVELS, axis=0)
-    return low, high
+        shares += _shares(len(scores), rng, replicates) @ (scores[:, None] > thresholds) * (len(scores) / len(runs))
+    return share, np.percentile(shares, _LEVELS, axis=0)
 
 
 def _single(strata: Strata) -> bool:

@@ -11,19 +11,8 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.load import (
-    CONDITION,
-    CONTROL,
-    COSTS,
-    CRITIC,
-    IDENTITY,
-    PROBES,
-    REFERENCES,
-    SETTING,
-    gaps_in_words,
-    labels,
-)
+from vd4rl_pomdp.report import load, stats
+from vd4rl_pomdp.report.load import CONDITION, COSTS, IDENTITY, SETTING, gaps_in_words, labels
 from vd4rl_pomdp.runs.files import Row
 
 SCORE = "Score = return / 10 or the task's own divisor"
@@ -52,14 +41,9 @@ def evaluations(episodes: pd.DataFrame) -> pd.DataFrame:
 def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tuple[str, ...]] = ()) -> pd.DataFrame:
     """Scores of every condition, mean over seeds with 95% interval: of the last evaluation, and of the best one.
 
-    Within a setting (task, quality, corruption), rows are sorted by score, or by name if the setting is `unranked`.
-    `absent` counts seeds that are missing, unfinished or diverged, and `missing` names them. A condition without
-    finished seeds has no numbers.
-
-    Args:
-        evaluated: evaluations of finished runs.
-        gaps: from `find_gaps`.
-        unranked: settings whose methods are not ranked.
+    Of evaluations of finished runs and the `gaps` of `find_gaps`. Within a setting (task, quality, corruption), rows
+    are sorted by score, or by name if the setting is `unranked`. `absent` counts seeds that are missing, unfinished or
+    diverged, and `missing` names them. A condition without finished seeds has no numbers.
     """
     rows = {condition: _scores(seeds) for condition, seeds in evaluated.groupby(list(CONDITION), sort=False)}
     absent = {
@@ -71,11 +55,9 @@ def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tu
         dict(zip(CONDITION, condition, strict=True)) | nothing | rows.get(condition, {}) | absent.get(condition, {})
         for condition in dict.fromkeys([*rows, *absent])
     ]
-    columns = (
-        *(*CONDITION, "step", "score", "low", "high", "seeds", "episodes", "few_seeds"),
-        *("best_step", "best_score", "best_low", "best_high", "absent", "missing"),
-    )
-    table = pd.DataFrame(found, columns=list(columns))
+    columns = [*CONDITION, "step", "score", "low", "high", "seeds", "episodes", "few_seeds"]
+    columns += ["best_step", "best_score", "best_low", "best_high", "absent", "missing"]
+    table = pd.DataFrame(found, columns=columns)
     places = table[list(SETTING)].itertuples(index=False, name=None)
     # If a gate fails, sorting by score would suggest a ranking of methods.
     by_name = pd.Series([place in unranked for place in places], table.index, dtype=bool)
@@ -102,7 +84,7 @@ def mean_and_ends(scores: np.ndarray, prefix: str = "", suffix: str = "") -> Row
 
 def _ordered(table: pd.DataFrame, *keys: pd.Series) -> pd.DataFrame:
     """Sort by setting, then references last, then by some keys; unknown values last."""
-    columns = [table[name] for name in SETTING if name in table] + [table["method"].isin(REFERENCES), *keys]
+    columns = [table[name] for name in SETTING if name in table] + [table["method"].isin(load.REFERENCES), *keys]
     order = pd.concat(columns, axis=1, ignore_index=True).pipe(lambda told: told.sort_values(list(told), kind="stable"))
     return table.loc[order.index].reset_index(drop=True)
 
@@ -118,7 +100,7 @@ def final_scores(evaluated: pd.DataFrame) -> pd.DataFrame:
     return evaluated[evaluated["step"] == evaluated.groupby(list(CONDITION), sort=False)["step"].transform("max")]
 
 
-def _strata(finals: pd.DataFrame) -> stats.Strata:
+def _strata(finals: pd.DataFrame) -> list[np.ndarray]:
     """Final score of every seed, one array per task and quality."""
     return [seeds.to_numpy() for _, seeds in finals.groupby(["task", "quality"], sort=False)["score"]]
 
@@ -138,22 +120,17 @@ def aggregate(evaluated: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
         row = dict(zip(SERIES, series, strict=True)) | {"tasks": 0, "of_tasks": of_tasks[series[0]], "seeds": 0}
         if series in measured:
             strata = _strata(measured[series])
-            row |= _aggregates(strata) | {"tasks": len(strata), "seeds": min(map(len, strata))}
+            scores, chosen = np.concatenate(strata), stats.aggregates(strata)
+            # Fixed seed: equal rows give a byte-identical page.
+            intervals = stats.bootstrap_intervals(strata, chosen, np.random.default_rng(0))
+            for name, statistic in chosen.items():
+                values = (float(statistic(scores)), *(intervals[name] or (None, None)))
+                row |= {f"{name}{end}": value for end, value in zip(ENDS, values, strict=True)}
+            row |= {"tasks": len(strata), "seeds": min(map(len, strata))}
         rows.append(row)
     numbers = [f"{name}{end}" for name in AGGREGATES for end in ENDS]
     table = pd.DataFrame(rows, columns=[*SERIES, *numbers, "tasks", "of_tasks", "seeds"])
     return _ordered(table, table["tasks"] < table["of_tasks"], -table["iqm"].astype(float))
-
-
-def _aggregates(strata: stats.Strata) -> Row:
-    scores, chosen = np.concatenate(strata), stats.aggregates(strata)
-    # Fixed seed: equal rows give a byte-identical page.
-    intervals = stats.bootstrap_intervals(strata, chosen, np.random.default_rng(0))
-    found: Row = {}
-    for name, statistic in chosen.items():
-        values = (float(statistic(scores)), *(intervals[name] or (None, None)))
-        found |= {f"{name}{end}": value for end, value in zip(ENDS, values, strict=True)}
-    return found
 
 
 def improvement(evaluated: pd.DataFrame) -> pd.DataFrame:
@@ -171,25 +148,21 @@ def improvement(evaluated: pd.DataFrame) -> pd.DataFrame:
         }
         for name, other in combinations(final, 2):
             if common := [task for task in final[name] if task in final[other]]:
-                row = _improvement([final[name][task] for task in common], [final[other][task] for task in common])
+                both = [(final[name][task], final[other][task]) for task in common]
+                strata, others = [one for one, _ in both], [another for _, another in both]
+                found = stats.improvement_interval(strata, others, np.random.default_rng(0), MANY)
+                pairs = [len(a) * len(b) for a, b in both]
+                chances = [stats.probability_of_improvement([a], [b]) for a, b in both]
+                low, high = found or (None, None)
+                row: Row = {"probability": float(np.mean(chances)) if found else None, "low": low, "high": high}
+                row |= {"wins": float(np.dot(chances, pairs)), "pairs": sum(pairs), "tasks": len(pairs)}
+                row["seeds"] = min(len(seeds) for pair in both for seeds in pair)
                 chance, low, high = (None if row[k] is None else 1 - row[k] for k in ("probability", "high", "low"))
                 turned = {"probability": chance, "low": low, "high": high, "wins": row["pairs"] - row["wins"]}
                 rows.append({"corruption": corruption, "method": name, "other": other} | row)
                 rows.append({"corruption": corruption, "method": other, "other": name} | row | turned)
     columns = ["corruption", "method", "other", "probability", "low", "high", "wins", "pairs", "tasks", "seeds"]
     return pd.DataFrame(rows, columns=columns)
-
-
-def _improvement(strata: stats.Strata, others: stats.Strata) -> Row:
-    found = stats.improvement_interval(strata, others, np.random.default_rng(0), MANY)
-    pairs = [len(one) * len(other) for one, other in zip(strata, others, strict=True)]
-    chances = [stats.probability_of_improvement([a], [b]) for a, b in zip(strata, others, strict=True)]
-    low, high = found or (None, None)
-    return {
-        **{"probability": float(np.mean(chances)) if found else None, "low": low, "high": high},
-        **{"wins": float(np.dot(chances, pairs)), "pairs": sum(pairs), "tasks": len(pairs)},
-        "seeds": min(map(len, (*strata, *others))),
-    }
 
 
 def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
@@ -203,8 +176,8 @@ def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
     parts = []
     for (corruption, _), members in finals.assign(label=labels(finals)).groupby(["corruption", "label"], sort=False):
         strata = _strata(members)
-        low, high = stats.profile_band(strata, thresholds, np.random.default_rng(0), MANY) or (np.nan, np.nan)
-        share = stats.performance_profile(np.concatenate(strata), thresholds)
+        share, band = stats.performance_profile(strata, thresholds, np.random.default_rng(0), MANY)
+        low, high = (np.nan, np.nan) if band is None else band
         names = {"corruption": corruption, "method": members["label"].iloc[0], "runs": len(members)}
         parts.append(pd.DataFrame(names | {"threshold": thresholds, "share": share, "low": low, "high": high}))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
@@ -221,7 +194,7 @@ def representations(table: pd.DataFrame) -> pd.DataFrame:
 
     A mean is missing if any seed lacks the value.
     """
-    means = _means(table[table["score"].notna()], ["action_loss", *PROBES, "return", *COSTS])
+    means = _means(table[table["score"].notna()], ["action_loss", *load.PROBES, "return", *COSTS])
     gaps = [
         (*condition, gaps_in_words(seeds[seeds["score"].isna()].to_dict("records")))
         for condition, seeds in table.groupby(list(CONDITION), sort=False)
@@ -241,13 +214,10 @@ def costs(table: pd.DataFrame) -> pd.DataFrame:
     """Mean, minimum and maximum seconds of both stages by method, over all finished runs, and their machines."""
     finished = table[table["score"].notna()]
     grouped = finished.assign(method=labels(finished)).groupby("method", sort=False)
-    spans = {
-        f"{cost}{end}": (cost, how) for cost in COSTS for end, how in (("", "mean"), ("_min", "min"), ("_max", "max"))
-    }
-    found = grouped.agg(
-        runs=("seed", "size"), **spans, machines=("machine", lambda names: "; ".join(sorted({*names} - {""})))
-    )
-    return found.reset_index()
+    ends = (("", "mean"), ("_min", "min"), ("_max", "max"))
+    spans = {f"{cost}{end}": (cost, how) for cost in COSTS for end, how in ends}
+    machines = ("machine", lambda names: "; ".join(sorted({*names} - {""})))
+    return grouped.agg(runs=("seed", "size"), **spans, machines=machines).reset_index()
 
 
 def control(table: pd.DataFrame) -> pd.DataFrame:
@@ -256,17 +226,13 @@ def control(table: pd.DataFrame) -> pd.DataFrame:
     Return, fraction of episodes above 80% of the data's return, and closed-loop action error are from the last
     evaluation: as trained, and under no corruption (`clean_`).
     """
-    names = ["data_return", *CONTROL, *(f"clean_{name}" for name in CONTROL), "path_error"]
+    names = ["data_return", *load.CONTROL, *(f"clean_{name}" for name in load.CONTROL), "path_error"]
     found = _means(table[table["score"].notna()], names)
     return _ordered(found, -found["return"])
 
 
 def elsewhere(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Scores of the final policies under other corruptions than in training, except none: mean over seeds.
-
-    Args:
-        episodes: of finished runs, from `episodes_frame`.
-    """
+    """Scores of finished runs' last policies under other corruptions than in training, but none: mean over seeds."""
     last = episodes["step"] == episodes.groupby("id")["step"].transform("max")
     others = episodes[last & ~episodes["as_trained"] & (episodes["evaluated_under"] != "none")]
     rows = []
@@ -286,15 +252,14 @@ def critics(table: pd.DataFrame) -> pd.DataFrame:
     """
     known = table["critic_value"].notna() | table["converged"].isna()
     mine = table[table["score"].notna() & known]
-    found = _means(mine.assign(critic_moved=mine["critic_moved"].abs()), [*CRITIC, "converged"])
+    found = _means(mine.assign(critic_moved=mine["critic_moved"].abs()), [*load.CRITIC, "converged"])
     return _ordered(found.assign(converged=found["converged"] * found["seeds"]))
 
 
 def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:
     """Mean action loss over pretraining runs of every condition, at up to POINTS steps that all runs logged.
 
-    Args:
-        curves: IDENTITY of each finished pretraining, and its losses by step.
+    `curves` are IDENTITY of each finished pretraining, and its losses by step.
     """
     rows = [named | {"step": step, "action_loss": loss} for named, told in curves for step, loss in told]
     parts = [pd.DataFrame(columns=[*CONDITION, "step", "action_loss", "seeds"])]

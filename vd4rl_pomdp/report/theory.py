@@ -44,23 +44,15 @@ def load_section(paths: list[Path]) -> str | None:
         try:
             return section(study)
         except (LookupError, TypeError, ValueError, AttributeError, UndefinedError) as error:
-            raise UserError(
-                f"{file}: is not a complete study ({type(error).__name__}: {error}); write it again: vd4rl-pomdp "
-                f"theory --out {file.parent}"
-            ) from error
+            what, again = f"{type(error).__name__}: {error}", f"vd4rl-pomdp theory --out {file.parent}"
+            raise UserError(f"{file}: is not a complete study ({what}); write it again: {again}") from error
     return None
 
 
 def section(study: Study) -> str:
     """The HTML section about a study."""
-    shown = {
-        "study": study,
-        "columns": COLUMNS,
-        "table": table_rows(study),
-        "facts": list(by_title(study).items()),
-        "diagram": to_svg(diagram_figure(study)),
-        "entropies": to_svg(entropy_figure(study["comparisons"])),
-    }
+    shown = {"study": study, "columns": COLUMNS, "table": table_rows(study), "facts": list(by_title(study).items())}
+    shown |= {"diagram": to_svg(diagram_figure(study)), "entropies": to_svg(entropy_figure(study["comparisons"]))}
     return render("theory_section.html", theory=shown)
 
 
@@ -114,9 +106,8 @@ def print_theory(study: Study) -> None:
         table.add_column()
         table.add_row("   printed", Text(rows[0]["printed"]))
         for row in rows:
-            table.add_row(
-                f"   {row['world']}", Text(f"{row['quantity']}: printed {row['claimed']}, computed {row['computed']}")
-            )
+            told = f"{row['quantity']}: printed {row['claimed']}, computed {row['computed']}"
+            table.add_row(f"   {row['world']}", Text(told))
         console.print(table)
 
 
@@ -126,31 +117,21 @@ def diagram_figure(study: Study) -> Figure:
     Arrows are transitions, labelled by their action.
     """
     figure = Figure(figsize=(9.6, 7.2), layout="constrained")
+    # States reached by +1 are on the outer ring, clockwise by s^A, and the others inside, beside their successors:
+    # (x, +1) leads to (x-1, -1) and back, so these two share an angle and no two arrows cross.
+    rings = [(1.2, x) if last > 0 else (0.5, x + 1) for x, last in study["states"]]
+    positions = [(radius * sin(angle * pi / 2), radius * cos(angle * pi / 2)) for radius, angle in rings]
     for axes, diagram in zip(figure.subplots(2, 3).flat, study["diagrams"], strict=True):
-        _draw(axes, diagram, study["states"], study["transitions"])
+        for start, action, end in study["transitions"]:
+            _arrow(axes, positions[start], positions[end], action)
+        for (x, y), (at, last), group in zip(positions, study["states"], diagram["classes"], strict=True):
+            axes.scatter([x], [y], s=480, color=COLOURS[group % len(COLOURS)], zorder=2)
+            axes.text(x, y, f"{at},{last:+d}", color="white", ha="center", va="center", fontsize=8, zorder=3)
+        classes = len(set(diagram["classes"]))
+        axes.set_title(f"{diagram['title']}\n{diagram['blocks']} codes; classes of states: {classes}", fontsize=10)
+        axes.set(xlim=(-1.45, 1.45), ylim=(-1.45, 1.45), aspect="equal")
+        axes.axis("off")
     return figure
-
-
-def _draw(axes: Axes, diagram: dict[str, Any], states: list, transitions: list) -> None:
-    positions = [_position(x, b) for x, b in states]
-    for start, action, end in transitions:
-        _arrow(axes, positions[start], positions[end], action)
-    for (x, y), state, group in zip(positions, states, diagram["classes"], strict=True):
-        axes.scatter([x], [y], s=480, color=COLOURS[group % len(COLOURS)], zorder=2)
-        axes.text(x, y, f"{state[0]},{state[1]:+d}", color="white", ha="center", va="center", fontsize=8, zorder=3)
-    classes = len(set(diagram["classes"]))
-    axes.set_title(f"{diagram['title']}\n{diagram['blocks']} codes; classes of states: {classes}", fontsize=10)
-    axes.set(xlim=(-1.45, 1.45), ylim=(-1.45, 1.45), aspect="equal")
-    axes.axis("off")
-
-
-def _position(position: int, last: int) -> tuple[float, float]:
-    """Place states reached by +1 on the outer ring, clockwise by s^A, and the others inside, beside their successors.
-
-    (x, +1) leads to (x-1, -1) and back, so these two share an angle and no two arrows cross.
-    """
-    radius, angle = (1.2, position) if last > 0 else (0.5, position + 1)
-    return radius * sin(angle * pi / 2), radius * cos(angle * pi / 2)
 
 
 def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], action: int) -> None:
@@ -174,11 +155,9 @@ def entropy_figure(rows: list[Row]) -> Figure:
             line = [r for r in mine if r["method"] == method]
             k = [r["k"] + (number - 2.5) * 0.03 for r in line]
             axes.plot(k, [r["entropy"] for r in line], "o-", color=COLOURS[number], label=method, ms=4, lw=1.2)
-        target = [r for r in mine if r["method"] == "mik+a"]
-        axes.plot(
-            [r["k"] for r in target], [r["multi_step_entropy"] for r in target], "k_", ms=18, label="P(a | s_t, s_t+k)"
-        )
-        axes.set(title=world, xlabel="k", xticks=[r["k"] for r in target])
+        target = {r["k"]: r["multi_step_entropy"] for r in mine if r["method"] == "mik+a"}
+        axes.plot([*target], [*target.values()], "k_", ms=18, label="P(a | s_t, s_t+k)")
+        axes.set(title=world, xlabel="k", xticks=[*target])
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("H(a_t | seen), nats")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=9)

@@ -115,13 +115,7 @@ class MetricsLog:
     def __init__(
         self, path: Path, step: int, mirrors: Mapping[str, Callable[[Sequence[Metrics]], Mirror]] | None = None
     ) -> None:
-        """Open or reopen.
-
-        Args:
-            path: the metrics.jsonl.
-            step: step from which the run resumes; 0 for a new run.
-            mirrors: functions by name that open a mirror, given all rows up to `step`.
-        """
+        """Open or reopen at the step from which the run resumes; `mirrors` open by name, given all rows up to there."""
         self._path = path
         # The checkpoint's step is trained but not yet evaluated.
         kept = [
@@ -183,13 +177,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
 def mirrors_of(
     run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]
 ) -> dict[str, Callable[[Sequence[Metrics]], Mirror]]:
-    """Functions that open the mirrors enabled in a run's config.
-
-    Args:
-        run: the run.
-        labels: method, task, quality, corruption, and other labels of the run.
-        card: pretraining metadata of its encoder; empty for a pretraining run.
-    """
+    """Functions that open the mirrors enabled in a run's config; `card` is its encoder's pretraining record, if any."""
     found: dict[str, Callable[[Sequence[Metrics]], Mirror]] = {}
     if run.config["wandb"] != "off":
         found["wandb"] = lambda rows: Wandb(run, labels, card, rows)
@@ -216,6 +204,7 @@ class Wandb:
         name = (folder / "id").read_text(encoding="ascii").strip()
         for earlier in folder.glob(f"offline-run-*-{name}"):  # `wandb sync` rejects the files of a killed process
             shutil.rmtree(earlier)
+        waits: dict[str, Any] = {"init_timeout": INIT_TIMEOUT_S, "finish_timeout": FINISH_TIMEOUT_S}
         whole = run.config | dict(labels) | {"stage": run.stage, "inputs": run.inputs}
         self._run = wandb.init(
             project=PROJECT,
@@ -226,13 +215,7 @@ class Wandb:
             reinit="create_new",
             job_type=run.stage,
             config=whole | ({"pretraining": dict(card)} if card else {}),
-            settings=wandb.Settings(
-                console="off",
-                quiet=True,
-                init_timeout=INIT_TIMEOUT_S,
-                finish_timeout=FINISH_TIMEOUT_S,
-                finish_timeout_raises=True,
-            ),
+            settings=wandb.Settings(console="off", quiet=True, **waits, finish_timeout_raises=True),
             **wandb_names(run, labels, card),
         )
         self._run.define_metric("*", step_metric="step")

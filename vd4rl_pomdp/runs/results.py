@@ -2,9 +2,8 @@
 
     runs.jsonl           one JSON object per run: its id, and the contents of its small files by name
     episodes.csv         raw evaluation rows; the first column is the run's id
-    certificates.json    whether a dataset under a corruption requires memory, as found by `vd4rl-pomdp certify`; keyed
-    by
-                         a hash of the dataset's content and the corruption, and also stored in the dataset's folder
+    certificates.json    whether a dataset under a corruption requires memory (`vd4rl-pomdp certify`), by a hash of the
+                         dataset's content and the corruption; also stored in the dataset's folder
 
 A report of a results folder equals one of the run folders, except for films. Both files are written whole, rows first.
 Rows of runs missing from runs.jsonl come from an interrupted write and are ignored.
@@ -28,7 +27,16 @@ from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.critic import TOLD, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, EVALUATION_SEED, episodes_until, read_episodes
-from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv, write_json
+from vd4rl_pomdp.runs.files import (
+    Row,
+    content_hash,
+    files_below,
+    groups,
+    read_json,
+    replacing_file,
+    write_csv,
+    write_json,
+)
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.provenance import CONTINUED
@@ -85,10 +93,8 @@ class Result:
     @property
     def machine(self) -> str:
         """Its GPU, or its processor and cores; "A then B" if it moved; empty if unknown."""
-        told = []
-        for part in self.parts:
-            processor, cores = part.get("processor"), part.get("cores")
-            told.append(part.get("gpu") or (f"{processor}, {cores} cores" if processor and cores else processor))
+        known = [(part.get("gpu"), part.get("processor"), part.get("cores")) for part in self.parts]
+        told = [gpu or (f"{name}, {cores} cores" if name and cores else name) for gpu, name, cores in known]
         return " then ".join(dict.fromkeys(str(one) for one in told if one))
 
     @property
@@ -243,9 +249,10 @@ def read_results(folder: Path | str) -> list[Result]:
         raise UserError(f"{path}: is not UTF-8 ({error}); take another copy") from error
     if not lines:
         raise UserError(f"{path}: is empty; take another copy, or remove it")
-    for row in read_episodes(folder / EPISODES_FILE):
+    where = folder / EPISODES_FILE
+    for row in read_episodes(where):
         if "id" not in row:
-            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
+            raise UserError(f"{where}: has no column 'id'; it was not written beside {RUNS}")
         # hundreds of thousands of rows repeat a few dozen strings: intern them
         shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
         by_run.setdefault(row["id"], []).append(shared)
@@ -258,7 +265,6 @@ def read_results(folder: Path | str) -> list[Result]:
             if name in runs:
                 raise UserError(f"{path}: names a run twice; remove one of the two lines")
             if len(rows) < count:
-                where = folder / EPISODES_FILE
                 raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; take another copy")
             files = {key: told[key] for key in FILES if key in told}
             losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
@@ -286,11 +292,8 @@ def write_results(out: Path, runs: Iterable[Result]) -> None:
 def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[Result]:
     """Every run at or below some paths, without duplicates, from run folders and results folders.
 
-    Results folders nested in another one belong to other experiments and are read only if named themselves.
-
-    Args:
-        paths: run folders, results folders, or folders that contain them.
-        but: a results folder to skip unless it is in `paths`.
+    Results folders nested in another one belong to other experiments and are read only if named themselves; the results
+    folder `but` is skipped unless it is in `paths`.
 
     Raises:
         UserError: a path is missing, there is no run, two runs with one id have different rows, or a file is damaged.
@@ -310,10 +313,8 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
         if but is None or place in named or place.resolve() != but.resolve():
             runs += read_results(place)
     if not runs:
-        raise UserError(
-            f"{named[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
-            f"folder (which holds {RUNS})"
-        )
+        what = "no runs (a run is a folder with config.json and metrics.jsonl) and no results folder (which holds"
+        raise UserError(f"{named[0]}: contains {what} {RUNS})")
     found: dict[str, Result] = {}
     for run in runs:
         other = found.setdefault(run.id, run)
@@ -360,11 +361,7 @@ def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
 
 
 def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
-    """All certificates at or below some folders, by id; the newest of duplicates.
-
-    Args:
-        places: folders.
-        but: a folder whose own file is skipped.
+    """All certificates at or below some folders, by id; the newest of duplicates. The own file of `but` is skipped.
 
     Raises:
         UserError: a file is damaged.
@@ -394,13 +391,7 @@ def certificate_in_words(certificate: Row) -> str:
 
 
 def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
-    """Certificates that apply to some runs, by id.
-
-    Args:
-        runs: runs read from their own folders also contribute their dataset's folder, if it exists.
-        places: folders to search, recursively.
-        but: a folder whose own file is skipped.
-    """
+    """Certificates that apply to some runs, by id: found as by `read_certificates`, and in runs' dataset folders."""
     sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
     known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())], but)
     return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
@@ -451,9 +442,8 @@ def _contradictions(run: Result) -> Iterator[str]:
 def _astray(run: Result) -> Iterator[str]:
     """What is wrong with a run's episodes: missing or extra ones, and inconsistent values."""
     config, own = run.record["config"], run.labels["corruption"]
-    played: dict[tuple[int, str], list[int]] = {}
-    for row in run.rows:
-        played.setdefault((row["step"], row["evaluated_under"]), []).append(row["episode"])
+    by_place = groups(run.rows, lambda row: (row["step"], row["evaluated_under"]))
+    played = {place: [row["episode"] for row in rows] for place, rows in by_place.items()}
     # `evaluate --keep` may add any number of episodes under other corruptions at the end
     wanted = {place: len(numbers) for place, numbers in played.items()}
     if {"updates", "eval_every", "eval_episodes"} <= config.keys():  # not recorded by earlier runs
@@ -463,35 +453,30 @@ def _astray(run: Result) -> Iterator[str]:
             yield f"it ends with update {(ended - {last}).pop()}, its record with {last}"
         # an unfinished run may have been interrupted during its newest evaluation
         end = last if run.finished else (run.diverged or {"step": run.step})["step"] - 1
-        wanted |= {
-            (step, under): 0
-            for step, under in played
-            if (run.finished or step <= end) and (step != last or under == own)
-        }
+        judged = [(step, under) for step, under in played if run.finished or step <= end]
+        wanted |= {(step, under): 0 for step, under in judged if step != last or under == own}
         wanted |= {(step, own): count for step in {*range(every, end + 1, every), *[last] * run.finished}}
         if run.finished and config.get("eval_clean") and own != "none":
             wanted[last, "none"] = config.get("eval_clean_episodes") or count
     for (step, under), count in sorted(wanted.items()):
         numbers = sorted(played.get((step, under), []))
-        if len(numbers) != count or numbers != list(range(len(numbers))):
+        if numbers != list(range(count)):
             yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
     task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})
     longest = min(config.get("eval_length", math.inf), task.decisions if task else math.inf)
     divisor = task.score_divisor if task else math.nan
     known = reference.get("actor") is not None if "mean_reward" in reference else None  # earlier runs do not record it
     wrong = {
-        "environment seeds are not those of their numbers": lambda row: (
-            row["episode_seed"] - row["episode"] - EVALUATION_SEED
-        ),
-        f"lengths are not within 1 and {longest}": lambda row: not 1 <= row["length"] <= longest,
-        f"scores are not their returns / {divisor:g}": lambda row: (
-            abs(row["score"] - row["return"] / divisor) > _ROUNDING
-        ),
-        "action errors lack, or tell of no actor": lambda row: (row["action_error"] is None) is known,
+        "environment seeds are not those of their numbers": [
+            row["episode_seed"] != row["episode"] + EVALUATION_SEED for row in run.rows
+        ],
+        f"lengths are not within 1 and {longest}": [not 1 <= row["length"] <= longest for row in run.rows],
+        f"scores are not their returns / {divisor:g}": [
+            abs(row["score"] - row["return"] / divisor) > _ROUNDING for row in run.rows
+        ],
+        "action errors lack, or tell of no actor": [(row["action_error"] is None) is known for row in run.rows],
     }
-    for what, of in wrong.items():
-        if count := sum(map(bool, map(of, run.rows))):
-            yield f"{count} {what}"
+    yield from (f"{sum(found)} {what}" for what, found in wrong.items() if any(found))
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
@@ -499,10 +484,8 @@ def refuse_loss(runs: Sequence[Result], out: Path) -> None:
     there = [run for run in _kept(out).values() if run.settled]
     written = {run.id: run for run in runs if run.settled}
     if lost := [run for run in there if run.id not in written]:
-        raise UserError(
-            f"{out}: holds the results of {len(lost)} runs that would be lost; name the folder among those to report, "
-            "remove it, or choose another --out"
-        )
+        what = "name the folder among those to report, remove it, or choose another --out"
+        raise UserError(f"{out}: holds the results of {len(lost)} runs that would be lost; {what}")
     for run in there:
         other = written[run.id]
         if run.measured != other.measured and other.ending <= run.ending:

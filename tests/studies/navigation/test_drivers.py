@@ -71,19 +71,6 @@ def test_waypoints_lie_between_the_centre_of_a_cell_and_its_point():
     np.testing.assert_array_equal(np.array(ahead)[:, 2], np.tile([1.2, -0.2], (50, 1)))
 
 
-def test_a_waypoint_is_passed_at_walking_pace_only():
-    env = MazeEnv("no_curtain", 5, pixels=False)
-    env.reset(seed=0)
-    goal = np.array([1.2, -0.2])
-    for travel, passed in ((0.2, 0), (0.05, 1)):
-        planner = WaypointPlanner(env, np.random.default_rng(0))
-        planner.act(np.array([-1.0, 1.0, 0.0, 0.0]), goal)
-        waypoint, left = planner._ahead[0], len(planner._ahead)
-        for place in (waypoint - [0, 0.09 + travel], waypoint - [0, 0.09]):
-            planner.act(np.array([*place, 0.0, 0.0]), goal)
-        assert left - len(planner._ahead) == passed, travel
-
-
 def drive(maze: str, seeds: int) -> tuple[np.ndarray, np.ndarray]:
     """States (seeds, ROWS, P) and actions of drives that are not drawn."""
     env, states, actions = MazeEnv(maze, pixels=False), [], []
@@ -142,23 +129,6 @@ def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not(
     assert goals_reached(idle, maze, actor.card["action_repeat"], 3) < reached / 3
 
 
-def test_every_first_person_maze_is_driven_by_an_actor_of_its_kinematics():
-    actors = {name: shipped_actor(spec) for name, spec in MAZES.items() if spec.first_person}
-    assert actors["compass_first_person"].card == actors["first_person"].card
-    means = [actors[name].weights["mean.weight"] for name in ("first_person", "hard_first_person")]
-    assert not np.array_equal(*means)
-
-
-def test_a_maze_that_a_planner_drives_through_trains_no_actor(tmp_path):
-    with pytest.raises(UserError, match="--maze is no_curtain, where a planner drives"):
-        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", maze="no_curtain"))
-
-
-def test_a_policy_of_no_decisions_is_refused(tmp_path):
-    with pytest.raises(UserError, match="--decisions is 0"):
-        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=0))
-
-
 def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
     trained = train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=2000))
     stored = read_actor(tmp_path / "actor.safetensors")
@@ -167,6 +137,18 @@ def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
     assert stored.card["decisions"] == 2048, "whole rounds of PPO"
     spread = [stored.act(seen, np.random.default_rng(i)) for i in range(50)]
     assert np.std(spread, axis=0).min() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"maze": "no_curtain"}, "--maze is no_curtain, where a planner drives"),
+        ({"decisions": 0}, "--decisions is 0"),
+    ],
+)
+def test_wrong_settings_of_a_policy_are_named(tmp_path, changes, message):
+    with pytest.raises(UserError, match=message):
+        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", **changes))
 
 
 @pytest.mark.parametrize("kind", ["file", "dangling link"])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.data import open_data
+from vd4rl_pomdp.studies.navigation.data import MazeData
 from vd4rl_pomdp.studies.navigation.train import ProbedObjective, evaluate, make_trainer, refitted_errors
 
 
@@ -14,13 +14,13 @@ from vd4rl_pomdp.studies.navigation.train import ProbedObjective, evaluate, make
 def probed(maze_set: Path, tmp_path_factory, monkeypatch) -> ProbedObjective:
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.getbasetemp() / "maze-cache"))
     config = NavigationConfig.of("smoke", data=maze_set, out=Path(), refit_steps=20, precision="fp32")
-    return make_trainer(open_data(config), config, torch.device("cpu"))[1]
+    return make_trainer(MazeData(config), config, torch.device("cpu"))[1]
 
 
 def shift_states(probed: ProbedObjective, held_out: bool) -> None:
     """Move the true states of the training or of the held-out rows."""
     split = int(probed.data.dataset.episode_start[probed.data.first_held_out])
-    probed.data.states.values[slice(split, None) if held_out else slice(split)] += 3
+    probed.data.states[slice(split, None) if held_out else slice(split)] += 3
 
 
 def test_a_refitted_probe_knows_nothing_of_held_out_states(probed: ProbedObjective):

@@ -8,7 +8,7 @@ from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, compare
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import WORLDS, biased, counterexample, echo, future_memory, momentum, past_memory
+from vd4rl_pomdp.studies.theory.world import counterexample, future_memory, past_memory
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 LIMIT = 2
@@ -73,18 +73,6 @@ def test_the_jumps_reach_back_behind_m():
     assert [row.certain for row in literal] == [True] * 5
 
 
-def test_the_literal_future_sees_its_target_at_k_1_and_breaks_the_proof_where_states_forget_actions():
-    assert compare(momentum(), VIEWS["mik+a literal"], MemoryLengths(1, 1), 1).sees_action
-    assert not compare(momentum(), VIEWS["mik+a"], MemoryLengths(1, 1), 1).sees_action
-    assert not compare(momentum(), VIEWS["mik+a literal"], MemoryLengths(1, 1), 3).multi_step
-    assert compare(momentum(), VIEWS["mik+a"], MemoryLengths(1, 1), 3).multi_step
-
-
-def test_mik_needs_a_future_that_decodes_without_actions():
-    for world, works in ((echo(), True), (momentum(), False)):
-        assert compare(biased(world), VIEWS["mik"], MemoryLengths(1, 1), 2).multi_step is works
-
-
 @pytest.mark.parametrize("name", [name for name in VIEWS if name != "fj+a literal"])
 def test_views_are_what_the_learned_objectives_declare(name):
     method, literal = name.removesuffix(" literal"), name.endswith(" literal")
@@ -97,10 +85,3 @@ def test_views_are_what_the_learned_objectives_declare(name):
         observations, acted = objective.visible(t, k, rows)
         declared = {("o", j) for j in observations} | {("a", j) for j in acted}
         assert VIEWS[name].visible(t, k, m, n, rows) == declared, (t, k)
-
-
-def test_every_world_of_the_gallery_is_decodable_as_its_story_says():
-    for make in WORLDS.values():
-        world = make()
-        assert past_memory(world, actions=True) is not None
-        assert len(world.reachable()) == len(world.states) * len(world.exogenous)

@@ -1,26 +1,22 @@
 from dataclasses import replace
-from fractions import Fraction
 
 import pytest
 from hypothesis import given, settings
 
 from tests.studies.theory.random_worlds import worlds
-from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.world import (
-    NOISE,
     biased,
     counterexample,
     diameter,
     echo,
     future_memory,
     momentum,
+    noisy,
     past_memory,
     uniform,
-    with_noise,
 )
 
-HALF = Fraction(1, 2)
 LONGEST = 3
 
 
@@ -70,9 +66,7 @@ def test_decodability_of_the_gallery():
 
 
 def test_noise_and_policies_change_neither_dynamics_nor_decodability():
-    noisy = with_noise(biased(momentum()), "noise", NOISE)
-    assert (past_memory(noisy, True), future_memory(noisy, True)) == (1, 1)
-    assert diameter(noisy) == diameter(momentum()) == 4
-    assert len(noisy.symbols) == 2 * len(momentum().symbols)
-    with pytest.raises(UserError, match="noise"):
-        with_noise(momentum(), "noise", {0: {0: HALF}})
+    world = noisy(biased(momentum()))
+    assert (past_memory(world, True), future_memory(world, True)) == (1, 1)
+    assert diameter(world) == diameter(momentum()) == 4
+    assert len(world.symbols) == 2 * len(momentum().symbols)

@@ -4,8 +4,6 @@ The loss of any predictor is at least H(a_t | what it sees), so these are two-si
 the tolerance means that an objective does not use what it may see, one below it that it sees more.
 """
 
-import random
-from fractions import Fraction
 from itertools import product
 
 import numpy as np
@@ -21,56 +19,15 @@ from vd4rl_pomdp.nn.objective import InverseObjective
 from vd4rl_pomdp.studies.theory.env import ExactWindows, exact_windows
 from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import BLANK, World, counterexample, finite_world
+from vd4rl_pomdp.studies.theory.world import BLANK, World, biased, counterexample, noisy, tiny
 
 MAX_K, M = 2, 1
 ABOVE, BELOW = 0.02, 1e-4
 """Tolerances in nats; rounding in float32 explains the second."""
 
 
-def random_world() -> World:
-    """Four states, two exogenous ones, noisy emission, a policy of its own at every state; always the same one."""
-    rng = random.Random(4)
-    step = {(s, a): rng.randrange(4) for s in range(4) for a in range(2)}
-    bias = {s: Fraction(rng.randint(1, 3), 4) for s in range(4)}
-    return finite_world(
-        "random",
-        range(4),
-        range(2),
-        range(2),
-        step=lambda s, a: step[s, a],
-        drift=lambda xi: {xi: Fraction(2, 3), 1 - xi: Fraction(1, 3)},
-        emit=lambda s, xi: {(s // 2, xi): Fraction(1, 2), (s % 2 + 2, xi): Fraction(1, 2)},
-        policy=lambda s, xi: {0: bias[s], 1: 1 - bias[s]},
-    )
-
-
-WORLDS = {"shorter counter": lambda: counterexample(every=2), "random": random_world}
-ROWS = {"shorter counter": 5, "random": 4}
-
-
-def test_windows_are_every_sequence_once_and_as_likely_as_its_actions():
-    """A coin that shows heads three times in four decides whether to stay or to change sides."""
-    world = finite_world(
-        "coin",
-        states=[0, 1],
-        exogenous=["-"],
-        actions=["stay", "change"],
-        step=lambda s, a: s if a == "stay" else 1 - s,
-        drift=lambda xi: {"-": 1},
-        emit=lambda s, xi: {s: 1},
-        policy=lambda s, xi: {"stay": Fraction(3, 4), "change": Fraction(1, 4)},
-        initial={(0, "-"): 1},
-    )
-    exact = exact_windows(world, 3)
-    assert len(exact.probability) == 8, "three actions, of two kinds each"
-    changes = exact.windows.action[..., 1]
-    for window, probability in enumerate(exact.probability.tolist()):
-        expected = 0.75 ** (3 - int(changes[window].sum())) * 0.25 ** int(changes[window].sum())
-        assert probability == pytest.approx(expected)
-        sides = changes[window, :2].cumsum(0) % 2
-        assert exact.state[window].tolist() == [0, *sides.int().tolist()]
-        assert exact.windows.obs[window, :, 1, 0, 0].tolist() == [0, *(255 * sides).int().tolist()]
+WORLDS = {"shorter counter": lambda: counterexample(every=2), "ladder": lambda: biased(noisy(tiny("ladder")))}
+ROWS = {"shorter counter": 5, "ladder": 4}
 
 
 def build(world: World, method: str, max_k: int, m: int = M, hidden: int = 32) -> InverseObjective:
@@ -136,7 +93,7 @@ def expected_loss(objective: InverseObjective, data: ExactWindows) -> torch.Tens
 
 
 CASES = [("shorter counter", name) for name in VIEWS if name != "fj+a literal"]
-CASES += [("random", name) for name in ("ah", "fj", "mik+a")]
+CASES += [("ladder", name) for name in ("ah", "fj", "mik+a")]
 
 
 @pytest.mark.parametrize(("world_name", "method"), CASES)

@@ -7,14 +7,12 @@ from hypothesis import given, settings
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths
 from vd4rl_pomdp.studies.theory.partition import (
-    discards_noise,
     forced_shares,
     relation,
     state_classes,
-    state_relation,
 )
 from vd4rl_pomdp.studies.theory.views import VIEWS
-from vd4rl_pomdp.studies.theory.world import NOISE, biased, counterexample, echo, momentum, with_noise
+from vd4rl_pomdp.studies.theory.world import biased, counterexample, echo
 
 MEMORY = MemoryLengths(3, 3)
 
@@ -71,22 +69,6 @@ def test_beyond_m_forward_jumps_separate_these_states_again():
     assert classes(world, "fj+a", 5) == [0, 1, 0, 1, 2, 3, 2, 3]
 
 
-def test_no_inverse_model_separates_parities_of_the_counterexample():
-    found = state_relation(counterexample(), range(1, 11))
-    blocks, conflicts = found.coarsest(), found.conflicts()
-    here, beside, opposite = (found.histories[state,] for state in ((0, 1), (1, 1), (2, 1)))
-    assert len(set(blocks)) == 4
-    assert blocks[here] == blocks[beside]
-    assert not conflicts[here, beside]
-    assert conflicts[here, opposite]
-
-
-def test_one_encoder_on_true_states_recovers_aperiodic_worlds():
-    for world, diameter in ((echo(), 4), (momentum(), 4)):
-        blocks = state_relation(world, range(1, diameter + 1)).coarsest()
-        assert len(set(blocks)) == len(world.states)
-
-
 def test_the_past_encoder_alone_may_merge_states_that_act_alike():
     """echo: (0, 1) and (2, 0) have the same successors; f can merge them under a policy that treats them alike."""
     world, ks = echo(), range(1, 5)
@@ -96,11 +78,3 @@ def test_the_past_encoder_alone_may_merge_states_that_act_alike():
     }
     partial = forced_shares(relation(biased(world), VIEWS["mik+a"], MemoryLengths(1, 1), ks))
     assert set(partial.values()) == {1}
-
-
-def test_which_objectives_can_drop_the_exogenous_part():
-    ks = (1, 2)
-    for name in ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a"):
-        assert discards_noise(relation(with_noise(momentum(), "noise", NOISE), VIEWS[name], MemoryLengths(1, 1), ks))
-    assert not discards_noise(relation(counterexample(), VIEWS["fj"], MEMORY, ks))
-    assert discards_noise(relation(counterexample(), VIEWS["fj+a"], MEMORY, ks))

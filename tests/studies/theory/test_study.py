@@ -128,14 +128,6 @@ def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
             assert words in text
 
 
-def test_out_that_cannot_be_a_folder_is_one_line(tmp_path, capsys):
-    (tmp_path / "x").write_text("")
-    with pytest.raises(SystemExit) as end:
-        main(["theory", "--out", str(tmp_path / "x")])
-    assert end.value.code == 2
-    assert "cannot be used" in capsys.readouterr().err
-
-
 def test_the_documentation_shows_the_computed_numbers(shown):
     study, _ = shown
     text = (Path(__file__).parents[3] / "docs" / "theory.md").read_text()

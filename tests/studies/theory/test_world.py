@@ -14,7 +14,6 @@ from vd4rl_pomdp.studies.theory.world import (
     finite_world,
     period,
     uniform,
-    with_policy,
 )
 
 HALF = Fraction(1, 2)
@@ -50,11 +49,6 @@ def test_a_bad_world_is_one_line(changes, message):
         small(**changes)
     assert "small" in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_policy_that_never_reaches_a_state_is_refused():
-    with pytest.raises(UserError, match="state 1 is unreachable"):
-        with_policy(small(initial={(0, "dark"): 1}), "stuck", lambda s: {0: 1})
 
 
 def brute_force(world, rows):

@@ -31,7 +31,6 @@ from vd4rl_pomdp.studies.navigation.pictures import TEXTURES, ExogenousNoise, to
 if TYPE_CHECKING:
     from vd4rl_pomdp.envs.maze import MazeEnv
 
-_RUNTIME_FIELDS = ("out", "workers", "preset")
 SAMPLES = 6
 """Sample observations per maze."""
 _FIRST_SAMPLE, _SAMPLE_STEP = 20, 12
@@ -91,7 +90,7 @@ def collect(config: MazeCollectConfig) -> list[Path]:
         "versions": {k: v for k, v in versions().items() if k in packages},
     }
     shape, step = (config.seed, config.trajectory_rows, config.action_repeat), config.trajectories_per_shard
-    jobs = [_Job(config.maze, number, *shape) for number in range(config.trajectories)]
+    jobs = [(config.maze, number, *shape) for number in range(config.trajectories)]
     shards = [
         Shard(config.out / f"{number}_{config.maze}.hdf5", jobs[start : start + step], attributes)
         for number, start in enumerate(range(0, len(jobs), step))
@@ -103,28 +102,18 @@ def collect(config: MazeCollectConfig) -> list[Path]:
 
 def collection(config: MazeCollectConfig) -> dict[str, Any]:
     """Settings that identify a dataset, as in its collection.json."""
-    return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
+    runtime = ("out", "workers", "preset")
+    return {name: value for name, value in jsonable(asdict(config)).items() if name not in runtime}
 
 
-@dataclass(frozen=True)
-class _Job:
-    """One trajectory to roll out."""
-
-    maze: str
-    trajectory: int
-    seed: int
-    rows: int
-    action_repeat: int
-
-
-def _roll_out(job: _Job) -> EpisodeArrays:
-    """Roll out one trajectory; returns its arrays by key."""
-    env = _environment(job.maze, job.action_repeat)
-    rng = np.random.default_rng([job.seed, job.trajectory])
+def _roll_out(job: tuple[str, int, int, int, int]) -> EpisodeArrays:
+    """Roll out one trajectory, by maze, number, seed, rows and action repeat; returns its arrays by key."""
+    maze, trajectory, seed, length, action_repeat = job
+    env, rng = _environment(maze, action_repeat), np.random.default_rng([seed, trajectory])
     act = _controller(env, rng)
-    frame, info = env.reset(seed=episode_seed(job.seed, job.trajectory))
+    frame, info = env.reset(seed=episode_seed(seed, trajectory))
     rows: list[tuple[Any, ...]] = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
-    while len(rows) < job.rows:
+    while len(rows) < length:
         action = _explore(act(info["state"], info["goal"]), env.maze_spec.style, rng)
         frame, reward, _, _, info = env.step(action)
         rows.append((frame, action, reward, info["state"]))
@@ -178,7 +167,7 @@ def sample_observations() -> dict[str, np.ndarray]:
         (SAMPLES, 3, H, W) uint8 by name.
     """
     rows = _FIRST_SAMPLE + _SAMPLE_STEP * (SAMPLES - 1) + 1
-    drives = {maze: _roll_out(_Job(maze, 0, 0, rows, ACTION_REPEAT)) for maze in MAZES}
+    drives = {maze: _roll_out((maze, 0, 0, rows, ACTION_REPEAT)) for maze in MAZES}
     samples = {maze: drive["observation"][_FIRST_SAMPLE::_SAMPLE_STEP] for maze, drive in drives.items()}
     pictures = torch.from_numpy(samples["three_curtains"])
     noise = ExogenousNoise(TEXTURES, 0.5, 0)

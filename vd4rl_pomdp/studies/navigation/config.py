@@ -60,9 +60,7 @@ _SMOKE: dict[str, Any] = {
 _NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "no_history", "ah", "ah+a"), strict=True))
 
 
-def network_of(method: str) -> str:
-    """The objective whose network a method uses: itself, unless it is a reference."""
-    return _NETWORK_OF.get(method, method)
+"""Objectives whose networks the references have."""
 
 
 @dataclass(frozen=True)
@@ -128,10 +126,9 @@ class NavigationConfig(TrainingConfig):
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
         """Options of method, memory, frame encoder and noise."""
-        method = METHODS.named(network_of(values["method"]))
-        reference = values["method"] in REFERENCES
+        method = METHODS.named(_NETWORK_OF.get(values["method"], values["method"]))
         return {
-            "options": (ReferenceOptions if reference else method.options).fill(values),
+            "options": (ReferenceOptions if values["method"] in REFERENCES else method.options).fill(values),
             "memory": memory_options(method.history, values),
             "frame": frame_options(method, values),
             "noise": (Options if values["exogenous"] == "none" else NoiseOptions).fill(values),
@@ -141,8 +138,7 @@ class NavigationConfig(TrainingConfig):
         """The same settings for the objective that a method trains: itself, unless it is a reference."""
         if self.method not in REFERENCES:
             return self
-        method = network_of(self.method)
-        values = self.defaults(self.preset) | flat(self)
+        method, values = _NETWORK_OF[self.method], self.defaults(self.preset) | flat(self)
         return replace(self, method=method, options=METHODS.named(method).options.fill(values))
 
     def check(self) -> None:

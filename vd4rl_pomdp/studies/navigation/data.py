@@ -5,7 +5,6 @@ Exogenous noise may be added to the images; the small presets use a quarter of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -14,61 +13,13 @@ from torch import Tensor
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.data import Dataset, View, open_dataset
-from vd4rl_pomdp.envs.mazes import MAZES, PICTURE_SIZE, MazeSpec
+from vd4rl_pomdp.envs.mazes import MAZES, PICTURE_SIZE
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions
-from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, Picture, to_grey50, to_rgb50
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, source_fingerprint, to_grey50, to_rgb50
 
 _BLOCK = 1000
 HELD_OUT = 10
 """One in this many trajectories, the last ones, is held out."""
-
-
-def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeSpec]:
-    """A maze's dataset and its maze; UserError for other datasets or without true states."""
-    dataset = open_dataset(path, cache)
-    attributes = dataset.store.meta["attributes"]
-    names = {stored.get("task") for stored in attributes}
-    for wrong, what in (
-        (len(names) != 1 or not names <= set(MAZES), "names no maze"),
-        (dataset.frame_size != PICTURE_SIZE, f"has frames of {dataset.frame_size} pixels, mazes of {PICTURE_SIZE}"),
-        (dataset.physics is None, "holds no true states ('physics'), which the probe needs"),
-    ):
-        if wrong:
-            raise UserError(f"{path}: {what}; collect a dataset with `vd4rl-pomdp navigation collect`")
-    if dataset.num_episodes < 2:
-        raise UserError(f"{path}: a single trajectory leaves none to hold out; collect more --trajectories")
-    if (rows := dataset.episode_end - dataset.episode_start).min() < 2:
-        raise UserError(
-            f"{path}: trajectory {int(rows.argmin())} is a single row, without a step; remove it, or "
-            "collect the dataset again"
-        )
-    return dataset, MAZES[names.pop()]
-
-
-@dataclass(frozen=True)
-class TrueStates:
-    """Standardised states of all rows of a dataset."""
-
-    values: Tensor
-    """(N, 4) float32."""
-    hidden: Tensor
-    """(N,) bool: a curtain covers the whole mass."""
-    mean: Tensor
-    std: Tensor
-    """(4,) float32, over the training rows."""
-
-    @classmethod
-    def of(cls, dataset: Dataset, maze: MazeSpec, training_rows: int) -> TrueStates:
-        """States of a dataset, standardised by its first `training_rows` rows."""
-        assert dataset.physics is not None
-        raw = torch.from_numpy(dataset.physics[:, maze.position + maze.velocity])
-        std, mean = torch.std_mean(raw[:training_rows], dim=0)
-        hidden = torch.from_numpy(maze.hidden(dataset.physics))
-        return cls(((raw - mean) / std).float(), hidden, mean.float(), std.float())
-
-    def to(self, device: torch.device) -> TrueStates:
-        """Copy on a device."""
-        return TrueStates(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
 
 class MazeView(View):
@@ -86,52 +37,64 @@ class MazeView(View):
         noisy = self._noise(pictures.flatten(0, -4), self.dataset.keys(rows).flatten())
         return noisy.view(pictures.shape)
 
-    def shrunk(self, picture: Picture) -> View:
-        """The same at 50x50, computed once so that training never touches the large images."""
-        channels, size = SHAPES[picture]
-        shrink = to_grey50 if channels == 1 else to_rgb50
-        small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
-        for rows in torch.arange(self.dataset.num_rows).split(_BLOCK):
-            small[rows] = shrink(self.observe(rows))
-        self.dataset.frames = small
-        return View(self.dataset, frame_stack=1)
-
-
-def open_data(config: NavigationConfig) -> MazeData:
-    """The config's dataset, with its exogenous noise, on the CPU."""
-    noise = None
-    if isinstance(config.noise, NoiseOptions):
-        noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
-    return MazeData(*open_maze_set(config.data), config, noise)
-
 
 class MazeData:
     """Batches of a maze's dataset: the last tenth of the trajectories is held out, the others are for training."""
 
-    def __init__(
-        self, dataset: Dataset, maze: MazeSpec, config: NavigationConfig, noise: ExogenousNoise | None
-    ) -> None:
-        self.dataset, self.maze, self._config = dataset, maze, config
-        held_out = max(1, dataset.num_episodes // HELD_OUT)
-        self.first_held_out = dataset.num_episodes - held_out
+    def __init__(self, config: NavigationConfig, cache: Path | None = None) -> None:
+        """Open the config's dataset, with its exogenous noise, on the CPU; UserError if it does not fit."""
+        dataset, path = open_dataset(config.data, cache), config.data
+        names = {stored.get("task") for stored in dataset.store.meta["attributes"]}
+        for wrong, what in (
+            (len(names) != 1 or not names <= set(MAZES), "names no maze"),
+            (dataset.frame_size != PICTURE_SIZE, f"has frames of {dataset.frame_size} pixels, mazes of {PICTURE_SIZE}"),
+            (dataset.physics is None, "holds no true states ('physics'), which the probe needs"),
+        ):
+            if wrong:
+                raise UserError(f"{path}: {what}; collect a dataset with `vd4rl-pomdp navigation collect`")
+        if dataset.num_episodes < 2:
+            raise UserError(f"{path}: a single trajectory leaves none to hold out; collect more --trajectories")
+        if (lengths := dataset.episode_end - dataset.episode_start).min() < 2:
+            raise UserError(
+                f"{path}: trajectory {int(lengths.argmin())} is a single row, without a step; remove it, "
+                "or collect the dataset again"
+            )
+        self.dataset, self.maze, self._config = dataset, MAZES[names.pop()], config
+        self.first_held_out = dataset.num_episodes - max(1, dataset.num_episodes // HELD_OUT)
         split = int(dataset.episode_start[self.first_held_out])
-        self.states = TrueStates.of(dataset, maze, split)
+        assert dataset.physics is not None
+        raw = torch.from_numpy(dataset.physics[:, self.maze.position + self.maze.velocity])
+        std, mean = torch.std_mean(raw[:split], dim=0)
+        self.states, self.mean, self.std = ((raw - mean) / std).float(), mean.float(), std.float()
+        """(N, 4) float32 states of all rows, standardised by mean and std (4,) of the training rows."""
+        self.hidden = torch.from_numpy(self.maze.hidden(dataset.physics))
+        """(N,) bool: a curtain covers the whole mass."""
         rows = dataset.transition_rows
         self.training_actions = dataset.action_after(rows[rows < split])
         """(M, 2) float32."""
         self.total = dataset.num_windows(config.window)
         self.training = int(dataset.windows_per_episode(config.window)[: self.first_held_out].sum())
         """Windows 0..training-1 are for training, the others are held out."""
-        self.view: View = MazeView(dataset, noise)
-        self.inputs = {"data": dataset.fingerprint} | ({} if noise is None else {"exogenous": noise.fingerprint()})
+        self.inputs = {"data": dataset.fingerprint}
         """Fingerprints of a run's inputs by name."""
+        noise = None
+        if isinstance(config.noise, NoiseOptions):
+            noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
+            self.inputs["exogenous"] = source_fingerprint(config.exogenous)
+        self.view: View = MazeView(dataset, noise)
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""
-        if isinstance(self.view, MazeView) and self._config.picture != "rgb100":
-            self.view = self.view.shrunk(self._config.picture)
+        if self._config.picture != "rgb100":  # shrunk once, so that training never touches the large images
+            channels, size = SHAPES[self._config.picture]
+            shrink = to_grey50 if channels == 1 else to_rgb50
+            small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
+            for rows in torch.arange(self.dataset.num_rows).split(_BLOCK):
+                small[rows] = shrink(self.view.observe(rows))
+            self.dataset.frames, self.view = small, View(self.dataset, frame_stack=1)
         self.dataset.to(device)
-        self.states = self.states.to(device)
+        for name in ("states", "hidden", "mean", "std"):
+            setattr(self, name, getattr(self, name).to(device))
         return self
 
     def windows(self, number: Tensor, length: int | None = None) -> Windows:

@@ -11,25 +11,20 @@ from collections import deque
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.envs.maze import CELL_OFFSET, MazeEnv
-from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, HARD, MOST_STEPS, MazeSpec, get_maze
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, FREE_CELLS, HARD, MOST_STEPS, MazeSpec, get_maze
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
-if TYPE_CHECKING:
-    from stable_baselines3 import PPO
-
 POSITION_GAIN, VELOCITY_GAIN = 3.0, 0.6
 """Gains of the planner: on distance to the waypoint, and against velocity."""
-Cell = tuple[int, int]
-"""Row and column in the maze's grid."""
 _ASSETS = Path(__file__).parent / "assets"
 FEATURES = 4
 _EPISODE = 200
@@ -42,10 +37,18 @@ class Planner:
     """Drives the mass to the environment's goal, straight through the cells; the caller adds noise."""
 
     def __init__(self, env: MazeEnv) -> None:
-        self._env = env
         self._maze = env.maze
-        self._next = {cell: self._towards(cell) for cell in self._free_cells()}
-        """By goal cell: the next cell on the shortest path from every cell."""
+        self._next: dict[tuple[int, int], dict[tuple[int, int], tuple[int, int]]] = {}
+        """By goal cell: the next cell on the shortest path from every cell, by breadth-first search from the goal."""
+        for goal in FREE_CELLS:
+            following, queue = {goal: goal}, deque([goal])
+            while queue:
+                i, j = queue.popleft()
+                for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+                    if cell in FREE_CELLS and cell not in following:
+                        following[cell] = (i, j)
+                        queue.append(cell)
+            self._next[goal] = following
 
     def act(self, state: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Action (2,) float64 for a (4,) state and a (2,) goal."""
@@ -53,7 +56,8 @@ class Planner:
 
     def waypoint(self, position: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Where to head from a (2,) position: the goal if it is at most one cell away, else the next cell."""
-        following, there = self._next[self._cell(goal)][self._cell(position)], self._cell(goal)
+        there = self._cell(goal)
+        following = self._next[there][self._cell(position)]
         return goal if following == there else self._maze.cell_rowcol_to_xy(np.array(following))
 
     def distance(self, position: np.ndarray, goal: np.ndarray) -> float:
@@ -74,24 +78,9 @@ class Planner:
             centers.append(self._maze.cell_rowcol_to_xy(np.array(here)))
         return centers
 
-    def _cell(self, position: np.ndarray) -> Cell:
+    def _cell(self, position: np.ndarray) -> tuple[int, int]:
         row, column = self._maze.cell_xy_to_rowcol(position)
         return int(row), int(column)
-
-    def _free_cells(self) -> list[Cell]:
-        rows = enumerate(self._maze.maze_map)
-        return [(i, j) for i, row in rows for j, kind in enumerate(row) if kind != 1]
-
-    def _towards(self, goal: Cell) -> dict[Cell, Cell]:
-        """Breadth-first search from a goal: the next cell from every cell; the goal leads to itself."""
-        free, following, queue = set(self._free_cells()), {goal: goal}, deque([goal])
-        while queue:
-            i, j = queue.popleft()
-            for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
-                if cell in free and cell not in following:
-                    following[cell] = (i, j)
-                    queue.append(cell)
-        return following
 
 
 class WaypointPlanner:
@@ -114,20 +103,16 @@ class WaypointPlanner:
         """Action (2,) float64 for a (4,) state and a (2,) goal."""
         place = state[:2]
         if not np.array_equal(goal, self._goal):
-            self._plan(place, goal)
+            between = self._planner.cells_after(place, goal)[:-1]
+            back = self._rng.uniform(size=(len(between), 2)) * self.JITTER * np.sign(CELL_OFFSET)
+            self._ahead = [*(np.array(between).reshape(-1, 2) + CELL_OFFSET - back), goal]
+            self._goal, self._before = goal, place
         action = self.POSITION_GAIN * (self._ahead[0] - place) - self.VELOCITY_GAIN * state[2:]
         slow = np.linalg.norm(place - self._before) < self.NEAR
         if len(self._ahead) > 1 and slow and np.linalg.norm(place - self._ahead[0]) < self.NEAR:
             self._ahead.pop(0)
         self._before = place
         return action
-
-    def _plan(self, place: np.ndarray, goal: np.ndarray) -> None:
-        """Plan waypoints to a goal from a (2,) position."""
-        between = self._planner.cells_after(place, goal)[:-1]
-        back = self._rng.uniform(size=(len(between), 2)) * self.JITTER * np.sign(CELL_OFFSET)
-        self._ahead = [*(np.array(between).reshape(-1, 2) + CELL_OFFSET - back), goal]
-        self._goal, self._before = goal, place
 
 
 @dataclass(frozen=True)
@@ -245,7 +230,22 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
         model.learn(config.decisions, callback=Report())
-    actor = _export(model, config)
+    policy: Any = model.policy
+    layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
+    weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}
+    arrays = {f"{name}.weight": layer.weight.detach().numpy().T.copy() for name, layer in weights.items()}
+    arrays |= {f"{name}.bias": layer.bias.detach().numpy().copy() for name, layer in weights.items()}
+    log_std = policy.log_std.detach().numpy().copy()  # it does not depend on the state
+    arrays |= {"log_std.weight": np.zeros((layers[-1].out_features, len(log_std)), np.float32), "log_std.bias": log_std}
+    card = {
+        "task": config.maze,
+        "algorithm": "PPO",
+        "decisions": model.num_timesteps,
+        "action_repeat": config.action_repeat,
+        "seed": config.seed,
+        "stable_baselines3": version("stable-baselines3"),
+    }
+    actor = Actor(arrays, card)
     actor.card["goals_in_20_episodes"] = goals_reached(actor, config.maze, config.action_repeat, 20)
     actor.save(config.out)
     return actor
@@ -261,23 +261,3 @@ def goals_reached(actor: Actor, maze: str, action_repeat: int, episodes: int) ->
             _, reward, _, _, info = env.step(controller.act(info["state"], info["goal"]))
             reached += int(reward)
     return reached
-
-
-def _export(model: PPO, config: FirstPersonConfig) -> Actor:
-    """PPO's actor as plain matrices; its standard deviation is state-independent."""
-    policy: Any = model.policy
-    layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
-    weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}
-    arrays = {f"{name}.weight": layer.weight.detach().numpy().T.copy() for name, layer in weights.items()}
-    arrays |= {f"{name}.bias": layer.bias.detach().numpy().copy() for name, layer in weights.items()}
-    log_std = policy.log_std.detach().numpy().copy()
-    arrays |= {"log_std.weight": np.zeros((layers[-1].out_features, len(log_std)), np.float32), "log_std.bias": log_std}
-    card = {
-        "task": config.maze,
-        "algorithm": "PPO",
-        "decisions": model.num_timesteps,
-        "action_repeat": config.action_repeat,
-        "seed": config.seed,
-        "stable_baselines3": version("stable-baselines3"),
-    }
-    return Actor(arrays, card)

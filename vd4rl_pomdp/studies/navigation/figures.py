@@ -63,7 +63,8 @@ def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    expected = _expected(frame, mazes)
+    trained, told = conditions_of(frame), {condition_of(row, "") for row in paper_rows()}
+    told |= {Condition("", method) for method in REFERENCES}
     for axes in panels.flat[len(mazes) :]:
         axes.set_axis_off()
     for axes, maze in zip(panels.flat, mazes, strict=False):
@@ -73,7 +74,7 @@ def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
                 if accuracy := [100 - error for error in numbers.get((*condition, *measure), {}).values()]:
                     axes.bar(at, np.mean(accuracy), _WIDTH, color=colour)
                     axes.plot([at] * len(accuracy), accuracy, **_SEED)
-                elif condition in expected:
+                elif condition._replace(maze="") in told or is_missing(condition, trained):
                     axes.plot(at, 2, **_NO_RUN)
                 if (paper := paper_number(condition, measure)) is not None:
                     axes.plot(at, 100 - paper, **_MARK)
@@ -93,15 +94,6 @@ def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
     return True
 
 
-def _expected(frame: pd.DataFrame, mazes: list[str]) -> set[Condition]:
-    """Conditions in some mazes that the paper, another maze or the references have."""
-    trained = conditions_of(frame)
-    told = {condition_of(row, maze) for row in paper_rows() for maze in mazes}
-    told |= {Condition(maze, method) for method in REFERENCES for maze in mazes}
-    elsewhere = (condition._replace(maze=maze) for condition in trained for maze in mazes)
-    return told | {condition for condition in elsewhere if is_missing(condition, trained)}
-
-
 def trajectories(runs: list[NavigationRun], path: Path) -> bool:
     """A held-out trajectory over the maze with the refitted probe's estimates; False if no run has one."""
     found: dict[Condition, Path] = {}
@@ -117,31 +109,24 @@ def trajectories(runs: list[NavigationRun], path: Path) -> bool:
     for maze, row in zip(mazes, panels, strict=True):
         for method, axes in zip(methods, row, strict=True):
             axes.set_axis_off()
-            if trajectory := found.get(Condition(maze, method)):
-                _draw_trajectory(axes, MAZES[maze], read_trajectory(trajectory))
-                axes.set_title(f"{maze}: {method}", fontsize=9)
-            else:
+            if (condition := Condition(maze, method)) not in found:
                 axes.text(0.5, 0.5, f"{maze}: {method}\nno run", ha="center", va="center", transform=axes.transAxes)
+                continue
+            axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), 2 * HALF_SIZE, 2 * HALF_SIZE, color="#e4c9a8", zorder=0))
+            for i, j in FREE_CELLS:
+                axes.add_patch(Rectangle((j - HALF_SIZE, HALF_SIZE - i - 1), 1, 1, color="#f7f7f7", zorder=0))
+            for (x, y), (half_x, half_y) in ((curtain.center, curtain.half) for curtain in MAZES[maze].curtains):
+                corner, size = (x - half_x, y - half_y), (2 * half_x, 2 * half_y)
+                axes.add_patch(Rectangle(corner, *size, color="#5b5b78", alpha=0.25, zorder=1))
+            axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
+            table = read_trajectory(found[condition])
+            for before, colour, label in (("", "black", "true"), ("estimated_", _ESTIMATE, "probe")):
+                points = [table[f"{before}{name}"][:_DRIVEN_ROWS] for name in "xy"]
+                axes.plot(*points, color=colour, lw=1, marker=".", markersize=2.5, label=label)
+            axes.legend(fontsize=7, loc="center left", framealpha=0.9)
+            axes.set_title(f"{maze}: {method}", fontsize=9)
     figure.savefig(path, dpi=120, metadata={"Software": None})
     return True
-
-
-def _draw_trajectory(axes: Any, maze: MazeSpec, table: Mapping[str, np.ndarray]) -> None:
-    """True and estimated positions over walls, free cells and curtains, from above."""
-    side = 2 * HALF_SIZE
-    axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), side, side, color="#e4c9a8", zorder=0))
-    for row, column in FREE_CELLS:
-        corner = column - HALF_SIZE, HALF_SIZE - row - 1
-        axes.add_patch(Rectangle(corner, 1, 1, color="#f7f7f7", zorder=0))
-    for curtain in maze.curtains:
-        (x, y), (half_x, half_y) = curtain.center, curtain.half
-        curtained = Rectangle((x - half_x, y - half_y), 2 * half_x, 2 * half_y, color="#5b5b78", alpha=0.25, zorder=1)
-        axes.add_patch(curtained)
-    axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
-    for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
-        points = [table[name][:_DRIVEN_ROWS] for name in names]
-        axes.plot(*points, color=colour, lw=1, marker=".", markersize=2.5, label=label)
-    axes.legend(fontsize=7, loc="center left", framealpha=0.9)
 
 
 def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
@@ -169,10 +154,28 @@ def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> 
         path: output file.
     """
     tables = {name: read_trajectory(file) for name, file in trajectories.items()}
-    ground = _ground(maze)
+    ground = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)
+    draw = ImageDraw.Draw(ground)
+    draw.rectangle([0, HEAD * _FINE, SIDE * _FINE, (SIDE + HEAD) * _FINE], fill=_WALL)
+    for row, column in FREE_CELLS:
+        left, top = column - HALF_SIZE, HALF_SIZE - row
+        draw.rectangle(_box(left, top, left + 1, top - 1), fill=_FLOOR)
     frames = []
     for row in range(min(len(table["x"]) for table in tables.values())):
-        panels = [np.asarray(_panel(name, table, row, maze, ground)) for name, table in tables.items()]
+        panels = []
+        for name, table in tables.items():
+            image = ground.copy()
+            draw = ImageDraw.Draw(image, "RGBA")
+            x, y = table["x"][row], table["y"][row]
+            draw.ellipse(_box(x - BALL_RADIUS, y + BALL_RADIUS, x + BALL_RADIUS, y - BALL_RADIUS), fill=_TRUE)
+            for (x, y), (half_x, half_y) in ((curtain.center, curtain.half) for curtain in maze.curtains):
+                draw.rectangle(_box(x - half_x, y + half_y, x + half_x, y - half_y), fill=_CURTAIN)
+            x, y = table["estimated_x"][row], table["estimated_y"][row]
+            box = _box(x - BALL_RADIUS, y + BALL_RADIUS, x + BALL_RADIUS, y - BALL_RADIUS)
+            draw.ellipse(box, outline=_RING, width=3 * _FINE)
+            small = image.resize((SIDE, SIDE + HEAD), Image.Resampling.LANCZOS)
+            ImageDraw.Draw(small).text((6, 5), f"{name}: mass and estimate", fill=_INK)
+            panels.append(np.asarray(small))
         frames.append(Image.fromarray(np.concatenate(panels, axis=1)))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=_MILLISECONDS, loop=0)
 
@@ -182,33 +185,6 @@ def to_pixels(x: float, y: float) -> tuple[float, float]:
     return (x + _SHOWN) / (2 * _SHOWN) * SIDE, HEAD + (_SHOWN - y) / (2 * _SHOWN) * SIDE
 
 
-def _panel(name: str, table: Mapping[str, np.ndarray], row: int, maze: MazeSpec, ground: Image.Image) -> Image.Image:
-    """One method's panel at one row."""
-    image = ground.copy()
-    draw = ImageDraw.Draw(image, "RGBA")
-    draw.ellipse(_around(table["x"][row], table["y"][row], BALL_RADIUS), fill=_TRUE)
-    for curtain in maze.curtains:
-        (x, y), (half_x, half_y) = curtain.center, curtain.half
-        corners = to_pixels(x - half_x, y + half_y), to_pixels(x + half_x, y - half_y)
-        draw.rectangle([_FINE * number for corner in corners for number in corner], fill=_CURTAIN)
-    at = table["estimated_x"][row], table["estimated_y"][row]
-    draw.ellipse(_around(*at, BALL_RADIUS), outline=_RING, width=3 * _FINE)
-    small = image.resize((SIDE, SIDE + HEAD), Image.Resampling.LANCZOS)
-    ImageDraw.Draw(small).text((6, 5), f"{name}: mass and estimate", fill=_INK)
-    return small
-
-
-def _ground(maze: MazeSpec) -> Image.Image:
-    """The maze without the mass, supersampled."""
-    image = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)
-    draw = ImageDraw.Draw(image)
-    draw.rectangle([0, HEAD * _FINE, SIDE * _FINE, (SIDE + HEAD) * _FINE], fill=_WALL)
-    for row, column in FREE_CELLS:
-        corners = [to_pixels(column - HALF_SIZE + i, HALF_SIZE - row - i) for i in (0, 1)]
-        draw.rectangle([_FINE * number for corner in corners for number in corner], fill=_FLOOR)
-    return image
-
-
-def _around(x: float, y: float, radius: float) -> list[float]:
-    (left, top), (right, bottom) = to_pixels(x - radius, y + radius), to_pixels(x + radius, y - radius)
-    return [_FINE * number for number in (left, top, right, bottom)]
+def _box(left: float, top: float, right: float, bottom: float) -> list[float]:
+    """Corners of a rectangle in the maze, in the fine pixels of a panel that is being drawn."""
+    return [_FINE * number for number in (*to_pixels(left, top), *to_pixels(right, bottom))]

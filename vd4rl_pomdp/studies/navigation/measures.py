@@ -10,7 +10,7 @@ import csv
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 
@@ -93,16 +93,6 @@ def held_out_loss(k: int = 0) -> Measure:
     return Measure("action_loss", "held_out", "", k=k)
 
 
-def measure_of(row: Mapping[str, Any]) -> Measure:
-    """The measure of a row of results.json; KeyError, TypeError or ValueError if it has none."""
-    return Measure(row["measure"], row["split"], row["probe"], row["rows"], int(row["k"]))
-
-
-def measure_rows(values: Mapping[Measure, float]) -> list[dict[str, Any]]:
-    """One row per value: the measure's fields and `value`."""
-    return [measure._asdict() | {"value": value} for measure, value in values.items()]
-
-
 @cache
 def paper_rows() -> list[dict[str, str]]:
     """Rows of the paper's tables."""
@@ -119,10 +109,10 @@ def condition_of(row: Mapping[str, str], maze: str) -> Condition:
 @cache
 def _paper_numbers() -> dict[tuple[Condition, str], float]:
     """The paper's numbers by condition and measure name (a raw error or the action loss)."""
-    names = {"action_loss": "action_loss"}
     return {
-        (condition_of(row, maze), names.get(what := row["component"], f"{RAW_PREFIX}{what}_error")): float(row[maze])
+        (condition_of(row, maze), what if what == "action_loss" else f"{RAW_PREFIX}{what}_error"): float(row[maze])
         for row in paper_rows()
+        for what in (row["component"],)
         for maze in PAPER_MAZES
     }
 

@@ -46,14 +46,10 @@ class ExogenousNoise:
     """Adds `weight` times an image of the pool to each observation and clips."""
 
     def __init__(self, source: str, weight: float, seed: int) -> None:
-        self._source, self._weight = source, weight
+        self._weight = weight
         self._seed = stream_seed(seed, "exogenous", "choice")
         self.pool = load_pool(source, seed)
         """(P, 3, 100, 100) uint8."""
-
-    def fingerprint(self) -> str:
-        """`source_fingerprint` of the pool."""
-        return source_fingerprint(self._source)
 
     def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
         """Noisy copies of (N, 3, 100, 100) uint8 images, drawn by (N,) int64 row keys."""
@@ -73,30 +69,22 @@ def source_fingerprint(source: str) -> str:
     return digest.hexdigest()
 
 
-def check_source(source: str) -> None:
-    """Raise UserError unless the source is a built-in pool or a folder of image files."""
+def load_pool(source: str, seed: int) -> Tensor:
+    """Images to add: (P, 3, 100, 100) uint8, at most POOL; of PNG and JPEG files only the drawn ones are decoded.
+
+    Raises:
+        UserError: the source is neither a built-in pool nor a folder of image files.
+    """
+    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
     if source in _MADE:
-        return
+        return _MADE[source](rng)
     if not Path(source).is_dir():
         raise UserError(f"{source}: no such folder; name one with images or use --exogenous {TEXTURES}")
-    if not _files(Path(source)):
+    if not (files := _files(Path(source))):
         raise UserError(
             f"{source}: no readable image; name a folder with CIFAR-10's data_batch files (python or binary), with PNG "
             f"or JPEG files, or use --exogenous {TEXTURES}"
         )
-
-
-def load_pool(source: str, seed: int) -> Tensor:
-    """Images to add: (P, 3, 100, 100) uint8; UserError if there are none."""
-    check_source(source)
-    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
-    if source in _MADE:
-        return _MADE[source](rng)
-    return _drawn(_files(Path(source)), rng)
-
-
-def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
-    """At most POOL images drawn from files; only the drawn PNG and JPEG files are decoded."""
     batches = {path: _read_cifar(path) for path in files if _is_cifar(path)}
     ends = np.cumsum([len(batches[path]) if path in batches else 1 for path in files])
     drawn = rng.permutation(ends[-1])[:POOL]
@@ -110,16 +98,15 @@ def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
 
 
 def _textures(rng: np.random.Generator) -> Tensor:
-    """Generated images of discs."""
-    return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
-
-
-def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
-    """Dead leaves, (100, 100, 3) uint8: overlapping discs with radius density r^-3 and colours around the image's mean.
+    """Dead leaves: overlapping discs with radius density r^-3 and colours around the image's mean.
 
     They have edge and scale statistics of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural
     images").
     """
+    return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
+
+
+def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
     own = rng.uniform(0, 255) + rng.normal(0, _CONTRAST / 2, 3)
     image = Image.new("RGB", (PICTURE_SIZE, PICTURE_SIZE), tuple(own.clip(0, 255).astype(int).tolist()))
     draw = ImageDraw.Draw(image)

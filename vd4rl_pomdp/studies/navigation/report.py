@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,16 +53,13 @@ from vd4rl_pomdp.studies.navigation.runs import (
     save_runs,
 )
 
-_REFITTED = "held-out trajectories, probe refitted on frozen states"
-PROTOCOLS = {
-    "training averages, probe trained beside the model (the paper's way)": ("training", "online"),
-    _REFITTED: ("held_out", "refit"),
+_ONLINE, _REFITTED = "training averages", "held-out trajectories"
+_PROTOCOLS = {
+    f"{_ONLINE}, probe trained beside the model (the paper's way)": ("training", "online"),
+    f"{_REFITTED}, probe refitted on frozen states": ("held_out", "refit"),
 }
 """Error protocols: split and probe."""
-_LOSS_PROTOCOLS = {
-    "training averages (the paper's way)": ("training", ""),
-    "held-out trajectories": ("held_out", ""),
-}
+_LOSS_PROTOCOLS = {f"{_ONLINE} (the paper's way)": ("training", ""), _REFITTED: ("held_out", "")}
 _UNITS = {False: "% of a standard deviation", True: "raw units x 100, beside the paper"}
 _TITLES = {
     "state_error": "State estimation errors, K = 1 and 15",
@@ -81,109 +78,76 @@ _PAPER_TABLES = tuple(_TITLES)[:7]
 MAIN_TEXT = ("no_curtain", "three_curtains")
 """Mazes of the tables in the paper's main text."""
 LITERAL = Condition("", "mik+a", 1, literal_future=True)
-Line = tuple[str, str, str, Condition, Measure]
-"""A cell of the layout: table, view, row, condition and measure."""
 
 
 def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
     """Cells of the paper's six tables (position and velocity are one of them) and of four of our own.
 
-    `_layout` lists all cells; the numbers come from a group-by of the frame of runs.
-
     Returns:
-        One row per cell: `table`, `view` and `row`; KEYS; `numbers` by seed with `mean`, `low` and `high` (95% t
-        interval); `seeds` and `of_seeds`, the maze's seeds under any condition; the `paper`'s number; `missing`, see
-        `is_missing`. Rows without a number from runs or paper and tables without runs are left out.
+        `table`, `view` and `row` where the number stands, KEYS, `mean`, `low` and `high` (95% t interval), `seeds` and
+        `of_seeds`, those with which the maze was trained under any condition; the `paper`'s number; and whether it is
+        `missing`, see `is_missing`.
+        Rows of a table for which neither a run nor the paper has a number are left out, and tables that no run has.
     """
-    lines = list(_layout(frame))
-    places = [(*line[:3], *line[3], *line[4]) for line in lines]
-    cells = pd.DataFrame(places, columns=["table", "view", "row", *KEYS])
-    trained = conditions_of(frame)
+    lines, trained, numbers = list(_layout(frame)), conditions_of(frame), numbers_of(frame)
+    cells = pd.DataFrame([(*line[:3], *line[3], *line[4]) for line in lines], columns=["table", "view", "row", *KEYS])
     cells["paper"] = [paper_number(condition, measure) for _, _, _, condition, measure in lines]
     cells["missing"] = [is_missing(condition, trained) for _, _, _, condition, _ in lines]
-    groups = frame.groupby(KEYS)["value"].agg(numbers=np.array).reset_index()
-    cells = cells.merge(groups, how="left", on=KEYS)
-    cells["numbers"] = [found if isinstance(found, np.ndarray) else np.empty(0) for found in cells["numbers"]]
-    cells["seeds"] = cells["numbers"].map(len)
+    found = [list(numbers.get((*line[3], *line[4]), {}).values()) for line in lines]
+    cells["seeds"] = list(map(len, found))
     cells["of_seeds"] = cells["maze"].map(frame.groupby("maze")["seed"].nunique())
-    cells["mean"] = [found.mean() if len(found) else None for found in cells["numbers"]]
-    ends = [mean_interval(found[:, None]) if len(found) else None for found in cells["numbers"]]
+    cells["mean"] = [np.mean(values) if values else None for values in found]
+    ends = [mean_interval(np.array(values)[:, None]) if values else None for values in found]
     cells[["low", "high"]] = [end or (None, None) for end in ends]
     told = (cells["seeds"] > 0) | cells["paper"].notna()
     of_row = [cells["table"], cells["view"], cells["row"]]
     return cells[told.groupby(of_row).transform("any") & (cells["seeds"].groupby(of_row[:2]).transform("max") > 0)]
 
 
-def _layout(frame: pd.DataFrame) -> Iterator[Line]:
-    """All cells, table by table and row by row."""
-    mazes = {raw: _mazes(frame, raw) for raw in (False, True)}
+def _layout(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, Condition, Measure]]:
+    """All cells, table by table and row by row: table, view, row, condition and measure."""
+    told, refitted = {condition_of(line, "") for line in paper_rows()}, tuple(_PROTOCOLS)[1]
+    references = {method: Condition("", method) for method in REFERENCES}
+    found = frame[list(Condition._fields)].assign(maze="").drop_duplicates().itertuples(index=False, name=None)
+    others = [row for row in map(Condition._make, found) if row not in {*told, *references.values(), LITERAL}]
+    groups: list[tuple[str, str, list[tuple[str, Condition, Measure]]]] = []
     for name in _PAPER_TABLES:
-        for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else PROTOCOLS).items():
-            for raw in (False,) if name == "action_loss" else (False, True):
-                view = protocol if name == "action_loss" else f"{protocol}; {_UNITS[raw]}"
-                yield from _paper_table(name, view, Measure("", split, probe), mazes[raw], raw)
-    for raw in (False, True):
-        view = f"{_REFITTED}; {_UNITS[raw]}"
-        for row, condition, measure in _references():
-            yield from _row("references", view, row, condition, measure.raw() if raw else measure, mazes[raw])
-    for raw in (False, True):
-        view, hiding = f"{_REFITTED}; {_UNITS[raw]}", [maze for maze in mazes[raw] if MAZES[maze].curtains]
-        for method in METHOD_NAMES:
-            for component in ("position", "velocity"):
-                measure = refitted_error(component, "hidden")
-                shown = measure.raw() if raw else measure
-                yield from _row("hidden", view, f"{method}, {component}", Condition("", method), shown, hiding)
-    for method in OBJECTIVES:
-        for k in (1, 5, 15):
-            where = "by_k", "held-out trajectories", f"{method}, k={k}"
-            yield from _row(*where, Condition("", method), held_out_loss(k), mazes[False])
-    others = _others(frame)
-    for raw in (False, True):
-        measure = refitted_error("state").raw() if raw else refitted_error("state")
-        for condition in others:
-            view = f"{_REFITTED}; {_UNITS[raw]}"
-            yield from _row("others", view, condition.short, condition, measure, mazes[raw])
-
-
-def _row(table: str, view: str, row: str, condition: Condition, measure: Measure, mazes: Iterable[str]) -> list[Line]:
-    return [(table, view, row, condition._replace(maze=maze), measure) for maze in mazes]
-
-
-def _mazes(frame: pd.DataFrame, raw: bool) -> list[str]:
-    """Columns of a table: mazes with runs, and all of the paper's mazes if any of them has runs."""
-    told = frame[frame["measure"].str.startswith(RAW_PREFIX)] if raw else frame
-    trained = set(told["maze"])
-    paper = trained & set(PAPER_MAZES)
-    return [maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES)]
-
-
-def _paper_table(name: str, view: str, measure: Measure, mazes: list[str], raw: bool) -> Iterator[Line]:
-    """Cells of one of the paper's tables; `measure` lacks its name."""
-    shown = [maze for maze in mazes if name != "exogenous_main" or MAZES[maze].paper in MAIN_TEXT]
-    for line in paper_rows():
-        if line["table"] == name.removesuffix("_main"):
-            what = line["component"] if name == "action_loss" else f"{line['component']}_error"
-            options = ", self-prediction" if line["self_prediction"] == "Y" else ""
-            label, found = f"{line['objective']}, K={line['k_max']}{options}", measure._replace(measure=what)
-            yield from _row(name, view, label, condition_of(line, ""), found.raw() if raw else found, shown)
-
-
-def _references() -> Iterator[tuple[str, Condition, Measure]]:
-    """Row name, condition and measure of references that the paper lacks: untrained, supervised, and the literal
-    future."""
-    for method in REFERENCES:
-        for component in ("state", "position", "velocity"):
-            yield f"{method}, {component}", Condition("", method), refitted_error(component)
-    yield "MIK+A, literal future, K=1, state error", LITERAL, refitted_error("state")
-    yield "MIK+A, literal future, K=1, action loss", LITERAL, held_out_loss()
-
-
-def _others(frame: pd.DataFrame) -> list[Condition]:
-    """Conditions, without mazes, that neither the paper nor the references have."""
-    told = {condition_of(line, "") for line in paper_rows()}
-    told |= {*(Condition("", method) for method in REFERENCES), LITERAL}
-    found = frame[list(Condition._fields)].assign(maze="").drop_duplicates().itertuples(index=False)
-    return [condition for condition in (Condition(*row) for row in found) if condition not in told]
+        printed = [line for line in paper_rows() if line["table"] == name.removesuffix("_main")]
+        for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else _PROTOCOLS).items():
+            rows = []
+            for line in printed:
+                what = "action_loss" if name == "action_loss" else f"{line['component']}_error"
+                options = ", self-prediction" if line["self_prediction"] == "Y" else ""
+                label = f"{line['objective']}, K={line['k_max']}{options}"
+                rows.append((label, condition_of(line, ""), Measure(what, split, probe)))
+            groups.append((name, protocol, rows))
+    errors = [(what, refitted_error(what)) for what in ("state", "position", "velocity")]
+    rows = [(f"{name}, {what}", condition, error) for name, condition in references.items() for what, error in errors]
+    rows += [
+        ("MIK+A, literal future, K=1, state error", LITERAL, refitted_error("state")),
+        ("MIK+A, literal future, K=1, action loss", LITERAL, held_out_loss()),
+    ]
+    groups.append(("references", refitted, rows))
+    hidden = [(what, refitted_error(what, "hidden")) for what in ("position", "velocity")]
+    rows = [(f"{name}, {what}", Condition("", name), error) for name in METHOD_NAMES for what, error in hidden]
+    groups.append(("hidden", refitted, rows))
+    rows = [(f"{name}, k={k}", Condition("", name), held_out_loss(k)) for name in OBJECTIVES for k in (1, 5, 15)]
+    groups.append(("by_k", _REFITTED, rows))
+    groups.append(("others", refitted, [(other.short, other, refitted_error("state")) for other in others]))
+    for table, protocol, rows in groups:
+        losses = table in ("action_loss", "by_k")
+        for raw in (False,) if losses else (False, True):
+            trained = set(frame["maze"][frame["measure"].str.startswith(RAW_PREFIX if raw else "")])
+            paper = trained & set(PAPER_MAZES)  # all of the paper's mazes if any of them has runs
+            mazes = [maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES)]
+            if table == "exogenous_main":
+                mazes = [maze for maze in mazes if MAZES[maze].paper in MAIN_TEXT]
+            elif table == "hidden":
+                mazes = [maze for maze in mazes if MAZES[maze].curtains]
+            view = protocol if losses else f"{protocol}; {_UNITS[raw]}"
+            for row, condition, measure in rows:
+                for maze in mazes:
+                    yield table, view, row, condition._replace(maze=maze), measure.raw() if raw else measure
 
 
 def cell_text(cell: pd.Series) -> str:
@@ -222,7 +186,6 @@ def write_tables(cells: pd.DataFrame, path: Path) -> None:
     write_csv(path, columns, shown[columns].to_dict("records"))
 
 
-RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 NEAR_ZERO = 5.0
 """Action loss (nats x 100) that counts as near zero; random guessing among 20 codes gives 300."""
 FEW = 15.0
@@ -253,6 +216,10 @@ class Claim(NamedTuple):
         """Whether two numbers satisfy the relation."""
         return bool(_RELATIONS[self.relation](left, self.factor * right))
 
+    def words(self, left: float, right: float) -> str:
+        """Two numbers as a table shows them; the second one only where there is a right side."""
+        return f"{left:.1f} / {right:.1f}" if self.right else f"{left:.1f}"
+
 
 class Verdict(NamedTuple):
     """A claim with the runs' numbers."""
@@ -270,6 +237,11 @@ class Verdict(NamedTuple):
     def holds(self) -> bool:
         """Whether the claim holds for the means."""
         return self.seeds > 0 and self.claim.holds(self.left, self.right)
+
+    @property
+    def words(self) -> list[str]:
+        """Both means, and whether it holds for them, as a table shows them."""
+        return [self.claim.words(self.left, self.right), "**yes**" if self.holds else "**no**"]
 
 
 def claims(maze: str) -> list[Claim]:
@@ -310,7 +282,7 @@ def claims(maze: str) -> list[Claim]:
         found.append(
             Claim("ah+a's state error, of no_history's", of("ah+a", "state"), ">", 1, of("no_history", "state"))
         )
-    for method in RECURRENT:
+    for method in OBJECTIVES[1:]:  # those with a memory
         text = f"{method}'s position error, of the untrained one's"
         found.append(Claim(text, of(method, "position"), "<", 0.5, of(UNTRAINED, "position")))
     return found
@@ -318,19 +290,14 @@ def claims(maze: str) -> list[Claim]:
 
 def judge(claim: Claim, numbers: Numbers) -> Verdict:
     """Evaluate a claim over the seeds that both sides have."""
-    left = _by_seed(claim.left, numbers)
-    right = dict.fromkeys(left, 1.0) if claim.right is None else _by_seed(claim.right, numbers)
+    left = numbers.get((*claim.left[0], *claim.left[1]), {})
+    right = numbers.get((*claim.right[0], *claim.right[1]), {}) if claim.right else dict.fromkeys(left, 1.0)
     seeds = sorted(left.keys() & right.keys())
     holding = sum(claim.holds(left[seed], right[seed]) for seed in seeds)
     means = [sum(side[seed] for seed in seeds) / len(seeds) if seeds else math.nan for side in (left, right)]
-    paper = [paper_number(*claim.left), 1.0 if claim.right is None else paper_number(*claim.right)]
+    paper = paper_number(*claim.left), paper_number(*claim.right) if claim.right else 1.0
     known = None if paper[0] is None or paper[1] is None else (paper[0], paper[1])
     return Verdict(claim, means[0], means[1], len(seeds), holding, known)
-
-
-def _by_seed(side: ClaimSide, numbers: Numbers) -> Mapping[int, float]:
-    condition, measure = side
-    return numbers.get((*condition, *measure), {})
 
 
 def verdict_lines(frame: pd.DataFrame) -> list[str]:
@@ -349,7 +316,7 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
     changes = f"{len(other)} change ({'; '.join(other)})" if other else "none changes"
     of_ah = {maze: paper_number(Condition(maze, "ah+a"), online_error("position").raw()) for maze in MAZES}
     recorder = ", ".join(f"{number:.1f} ({maze})" for maze, number in of_ah.items() if number is not None)
-    return [
+    lines = [
         "## Which statements hold",
         "",
         f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(pairs) - len(judged)} wait for runs. "
@@ -360,34 +327,24 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
         "",
         "| maze | statement | here, % of std | holds | seeds | here, raw x 100 | holds | the paper's numbers |",
         "|---|---|---|---|---|---|---|---|",
-        *(_verdict_row(*pair) for pair in pairs),
+    ]
+    waiting = ["no run yet", "-", "-"]
+    for maze, percent, raw in pairs:
+        claim = percent.claim
+        columns = [maze, f"{claim.text} {claim.relation} {claim.factor:g}{' x' if claim.right else ''}"]
+        columns += [*percent.words, f"{percent.seeds_holding} of {percent.seeds}"] if percent.seeds else waiting
+        columns += ["no error", "-"] if raw.claim == claim else raw.words if raw.seeds else ["-", "-"]
+        columns.append(
+            f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}" if raw.paper else "none"
+        )
+        lines.append(f"| {' | '.join(columns)} |")
+    return [
+        *lines,
         "",
         "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
         f"and need not keep the state. In the paper its position error is {recorder}.",
         "",
     ]
-
-
-def _verdict_row(maze: str, percent: Verdict, raw: Verdict) -> str:
-    claim = percent.claim
-    bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
-    columns = [maze, f"{claim.text} {bound}", "no run yet", "-", "-", "-", "-"]
-    if percent.seeds:
-        columns[2:5] = [*_answer(percent), f"{percent.seeds_holding} of {percent.seeds}"]
-    if raw.claim == claim:
-        columns[5:] = ["no error", "-"]
-    elif raw.seeds:
-        columns[5:] = _answer(raw)
-    paper = f"{_sides(claim, *raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}" if raw.paper else "none"
-    return f"| {' | '.join([*columns, paper])} |"
-
-
-def _answer(verdict: Verdict) -> list[str]:
-    return [_sides(verdict.claim, verdict.left, verdict.right), "**yes**" if verdict.holds else "**no**"]
-
-
-def _sides(claim: Claim, left: float, right: float) -> str:
-    return f"{left:.1f} / {right:.1f}" if claim.right else f"{left:.1f}"
 
 
 Samples = Callable[[], Mapping[str, np.ndarray]]
@@ -438,78 +395,52 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     drawn = samples() if samples is not None else None  # before anything is written, since OpenGL may be missing
     with owned(out):
         save_runs(runs, out)
-        (out / "figures").mkdir(exist_ok=True)
-        frame = frame_of(runs)
-        pictures = _draw(runs, frame, drawn, out / "figures")
+        frame, state, folder = frame_of(runs), refitted_error("state"), out / "figures"
+        folder.mkdir(exist_ok=True)
+        shown = {
+            "accuracy.png": figures.accuracy_bars(frame, state, folder / "accuracy.png"),
+            "accuracy_raw.png": figures.accuracy_bars(frame, state.raw(), folder / "accuracy_raw.png"),
+            "trajectories.png": figures.trajectories(runs, folder / "trajectories.png"),
+            "observations.png": drawn and figures.observations(drawn, folder / "observations.png"),
+        }
         cells = make_tables(frame)
         write_tables(cells, out / "tables.csv")
-        lines = [*_head(runs, unfinished), *verdict_lines(frame), *pictures, *table_sections(cells), _COMMANDS]
-        commands = [(run.command, run.condition.maze, run.result.files["timing"]["seconds"]) for run in runs]
-        lines += code_block([f"{words}  # {maze}, {float(seconds):.0f} s" for words, maze, seconds in commands], "bash")
+        lines = [*_head(runs, unfinished), *verdict_lines(frame)]
+        for name in filter(shown.get, shown):
+            lines += [f"![{_CAPTIONS[name][0]}](figures/{name})", "", _CAPTIONS[name][1], ""]
+        lines += [*table_sections(cells), _COMMANDS]
+        commands = [(run, run.result.files["results"]["command"], run.result.files["timing"]) for run in runs]
+        told = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
+        lines += code_block(told, "bash")
         write_text(out / "report.md", "\n".join(lines) + "\n")
     return out / "report.md"
 
 
-def _draw(
-    runs: list[NavigationRun], frame: pd.DataFrame, samples: Mapping[str, np.ndarray] | None, folder: Path
-) -> Iterator[str]:
-    """Draw the possible figures; yields page lines that show them."""
-    state = refitted_error("state")
-    drawn = {
-        "accuracy.png": lambda path: figures.accuracy_bars(frame, state, path),
-        "accuracy_raw.png": lambda path: figures.accuracy_bars(frame, state.raw(), path),
-        "trajectories.png": lambda path: figures.trajectories(runs, path),
-        "observations.png": lambda path: samples and figures.observations(samples, path),
-    }
-    for name, draw in drawn.items():
-        if draw(folder / name):
-            title, caption = _CAPTIONS[name]
-            yield from (f"![{title}](figures/{name})", "", caption, "")
-
-
 def _head(runs: list[NavigationRun], unfinished: list[Result]) -> list[str]:
     """Head of the page: runs, cost, differing settings, and how to read the tables."""
-    mazes, seeds = {run.condition.maze for run in runs}, sorted({run.seed for run in runs})
-    told = {run.condition.maze: run.result.record["config"]["exogenous"] for run in runs if run.condition.exogenous}
-    images = [f"{markdown(name)} in {code(maze)}" for maze, name in told.items()]
-    lines = [
-        "# Navigation: what the objectives know of the state",
-        "",
-        f"Runs: {len(runs)}. Preset: {code(runs[0].preset)}. Seeds: {', '.join(map(str, seeds))}. {_budget(runs)}",
-        "",
-        *_unlike(runs),
-        *([_HARD] if any(MAZES[maze].style is HARD for maze in mazes) else []),
-        *([f"Exogenous noise adds {', '.join(images)}.", ""] if images else []),
-    ]
-    for result in unfinished:
-        steps = result.record["config"].get("steps", "?")
-        lines += [f"Unfinished, in no table: {code(str(result.path))} at {result.step} of {steps} steps.", ""]
-    return [*lines, _READING]
-
-
-def _budget(runs: list[NavigationRun]) -> str:
-    """Cost of the runs and their machines."""
-    trained = [run for run in runs if run.condition.method != UNTRAINED] or runs
-    timings = [run.result.files["timing"] for run in trained]
+    seeds = sorted({run.seed for run in runs})
+    timings = [run.result.files["timing"] for run in runs if run.condition.method != UNTRAINED]
+    timings = timings or [run.result.files["timing"] for run in runs]
     minutes = sorted(round(float(timing["seconds"]) / 60) for timing in timings)
     took = " to ".join(dict.fromkeys(map(str, (minutes[0], minutes[-1]))))
     sets = [run.result.record.get("collection") or {} for run in runs]
-    samples = {made["trajectories"] * made["trajectory_rows"] for made in sets if made}
-    machines = markdown("; ".join(sorted({run.result.machine or "not recorded" for run in runs})))
-    return (
-        f"Budget: {_either(int(timing['steps']) for timing in timings)} gradient steps on {_either(samples)} samples, "
-        f"{took} minute{'s' * (took != '1')} a run ({machines}). "
-        "The paper's: 200,000 steps on 500,000 samples."
+    steps, samples = (
+        " or ".join(f"{count:,}" for count in sorted(counts)) or "unknown"
+        for counts in (
+            {int(timing["steps"]) for timing in timings},
+            {made["trajectories"] * made["trajectory_rows"] for made in sets if made},
+        )
     )
-
-
-def _either(counts: Iterator[int] | set[int]) -> str:
-    return " or ".join(f"{count:,}" for count in sorted(set(counts))) or "unknown"
-
-
-def _unlike(runs: list[NavigationRun]) -> list[str]:
-    """One sentence per setting that differs among runs on one maze and is not part of their condition."""
-    lines = []
+    machines = markdown("; ".join(sorted({run.result.machine or "not recorded" for run in runs})))
+    lines = [
+        "# Navigation: what the objectives know of the state",
+        "",
+        f"Runs: {len(runs)}. Preset: {code(runs[0].preset)}. Seeds: {', '.join(map(str, seeds))}. "
+        f"Budget: {steps} gradient steps on {samples} samples, {took} minute{'s' * (took != '1')} a run ({machines}). "
+        "The paper's: 200,000 steps on 500,000 samples.",
+        "",
+    ]
+    unlike = []  # one sentence per setting that differs among runs on one maze and is not part of their condition
     for maze, members in groupby(runs, key=lambda run: run.condition.maze):
         mine = list(members)
         settings = pd.DataFrame([run.settings for run in mine], index=[code(run.condition.short) for run in mine])
@@ -517,7 +448,14 @@ def _unlike(runs: list[NavigationRun]) -> list[str]:
             is_without = np.array([not getattr(run.condition, name, True) for run in mine])  # e.g. self_prediction
             values = settings[name][~is_without].dropna().str[: 8 if name == "set" else None]
             found = list(values.value_counts().index)
-            where = [f"{one} in {', '.join(values.index[values == one].unique())}" for one in found[1:]]
-            if where:
-                lines.append(f"Not alike in {code(maze)}: {name} is {found[0]}, but {'; '.join(where)}.  ")
-    return [*lines, ""] if lines else []
+            if where := [f"{one} in {', '.join(values.index[values == one].unique())}" for one in found[1:]]:
+                unlike.append(f"Not alike in {code(maze)}: {name} is {found[0]}, but {'; '.join(where)}.  ")
+    lines += [*unlike, ""] if unlike else []
+    lines += [_HARD] if any(MAZES[run.condition.maze].style is HARD for run in runs) else []
+    told = {run.condition.maze: run.result.record["config"]["exogenous"] for run in runs if run.condition.exogenous}
+    images = [f"{markdown(name)} in {code(maze)}" for maze, name in told.items()]
+    lines += [f"Exogenous noise adds {', '.join(images)}.", ""] if images else []
+    for result in unfinished:
+        of = result.record["config"].get("steps", "?")
+        lines += [f"Unfinished, in no table: {code(str(result.path))} at {result.step} of {of} steps.", ""]
+    return [*lines, _READING]

@@ -22,7 +22,7 @@ from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.results import Result, find_results, refuse_loss, write_results
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, Condition, Measure, measure_of
+from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, Condition, Measure
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 KEYS = [*Condition._fields, *Measure._fields]
@@ -57,11 +57,6 @@ class NavigationRun:
     def identity(self) -> tuple[Any, ...]:
         """Identifies this run."""
         return (*self.condition, self.preset, self.seed)
-
-    @property
-    def command(self) -> str:
-        """The command that trains it."""
-        return self.result.files["results"]["command"]
 
     @property
     def settings(self) -> dict[str, str]:
@@ -128,19 +123,15 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
         if before is not None and before.identity == run.identity:
             places = f"{before.result.path} and {run.result.path}"
             raise UserError(f"{places}: {run.condition.name} seed {run.seed} occurs twice; keep one")
-        _refuse_mixture(first.setdefault(run.condition, run), run)
+        other = first.setdefault(run.condition, run)
+        for name in {**other.settings, **run.settings}:
+            values = [one.settings.get(name, "none") for one in (other, run)]
+            if values[0] != values[1]:
+                raise UserError(
+                    f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
+                    f"({', '.join(values)}) and cannot be averaged; report them separately"
+                )
     return runs
-
-
-def _refuse_mixture(other: NavigationRun, run: NavigationRun) -> None:
-    """Raise UserError unless two seeds of a condition have the same budget, data and settings."""
-    for name in {**other.settings, **run.settings}:
-        values = [one.settings.get(name, "none") for one in (other, run)]
-        if values[0] != values[1]:
-            raise UserError(
-                f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
-                f"({', '.join(values)}) and cannot be averaged; report them separately"
-            )
 
 
 def _read_run(result: Result) -> NavigationRun:
@@ -167,7 +158,12 @@ def _read_run(result: Result) -> NavigationRun:
             config["exogenous"] != "none",
             bool(config.get("literal_future", False)),
         )
-        values = {measure_of(row): float(f"{row['value']:.6g}") for row in results["rows"]}
+        values = {
+            Measure(row["measure"], row["split"], row["probe"], row["rows"], int(row["k"])): float(
+                f"{row['value']:.6g}"
+            )
+            for row in results["rows"]
+        }
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{result.place}: its results are damaged ({error}); train it again") from error
     if wrong := {measure.measure: value for measure, value in values.items() if not math.isfinite(value)}:

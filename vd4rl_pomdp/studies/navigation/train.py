@@ -42,8 +42,8 @@ from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
-from vd4rl_pomdp.studies.navigation.data import MazeData, open_data
-from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure, measure_rows
+from vd4rl_pomdp.studies.navigation.data import MazeData
+from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES
 
 STATE_DIM = 4
@@ -91,23 +91,17 @@ class ErrorSums(nn.Module):
         self.sums.zero_()
         self.counts.zero_()
 
-    def percent(self) -> dict[str, float]:
-        """`state`, `position`, `velocity`; with suffix `_hidden` if any counted row was hidden."""
-        return self._times(torch.ones(STATE_DIM))
-
     def both(self, std: Tensor) -> dict[str, float]:
-        """`percent`, and with RAW_PREFIX the errors in the simulator's units x 100, by the states' (4,) `std`."""
-        raw = self._times(std.cpu())
-        return self.percent() | {f"{RAW_PREFIX}{name}": value for name, value in raw.items()}
-
-    def _times(self, scale: Tensor) -> dict[str, float]:
-        named: dict[str, float] = {}
+        """`state`, `position`, `velocity` in percent of `std` (4,); with suffix `_hidden` if a counted row was hidden;
+        and all of them with RAW_PREFIX in the simulator's units x 100."""
         sums, counts = self.sums.cpu(), self.counts.cpu()
-        for number, suffix in enumerate(("", "_hidden")):
-            if counts[number]:
-                means = 100 * scale * sums[number] / counts[number]
-                named |= {f"{name}{suffix}": float(means[part].mean()) for name, part in COMPONENTS.items()}
-        return named
+        return {
+            f"{unit}{name}{suffix}": float((100 * scale * sums[number] / counts[number])[part].mean())
+            for unit, scale in (("", torch.ones(STATE_DIM)), (RAW_PREFIX, std.cpu()))
+            for number, suffix in enumerate(("", "_hidden"))
+            if counts[number]
+            for name, part in COMPONENTS.items()
+        }
 
 
 def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
@@ -171,9 +165,9 @@ class ProbedObjective(Objective):
         past, future = self.objective.representations(window)
         rows = self.data.dataset.rows(window.key)
         supervised = self.config.method in SUPERVISED
-        estimate, truth = self.probe(past, frozen=not supervised), self.data.states.values[rows]
+        estimate, truth = self.probe(past, frozen=not supervised), self.data.states[rows]
         error = (estimate.float() - truth).square().mean()
-        states = (estimate, truth, self.data.states.hidden[rows])
+        states = (estimate, truth, self.data.hidden[rows])
         if supervised:
             return error, {"loss": error.detach()}, states
         loss, logs = self.objective.loss_of(past, future, window, progress)
@@ -185,7 +179,7 @@ class ProbedObjective(Objective):
 
     def take_errors(self) -> dict[str, float]:
         """Mean errors since the last call."""
-        found = self.errors.both(self.data.states.std)
+        found = self.errors.both(self.data.std)
         self.errors.reset()
         return found
 
@@ -215,8 +209,6 @@ def learning_rate(config: NavigationConfig, step: int) -> float:
     return config.learning_rate * rising * falling * share_taken
 
 
-RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
-"""Files of a finished run."""
 TRAJECTORY_ROWS = 200
 """Rows of the held-out trajectory saved for a figure."""
 
@@ -225,10 +217,13 @@ def train(config: NavigationConfig) -> RunFolder:
     """Run or resume the stage; returns the run's folder."""
     config.check()
     refuse_inside(config.out)
-    data = open_data(config)
+    data = MazeData(config)
     trainer, probed = make_trainer(data, config, pick_device(config.device))
-    labels = {"method": config.method, "task": data.maze.name}
-    with RunFolder(config.out, STAGE, config, data.inputs, RESULTS, collection=read_plan(config.data)) as run:
+    labels, results = (
+        {"method": config.method, "task": data.maze.name},
+        (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN),
+    )
+    with RunFolder(config.out, STAGE, config, data.inputs, results, collection=read_plan(config.data)) as run:
         if not run.finished:
             steps, last_averaged = 0 if config.method == UNTRAINED else config.steps, config.steps - config.average_last
             trainer.run(run, steps, " ".join(reversed(labels.values())), labels, probed.take_errors, last_averaged)
@@ -268,7 +263,7 @@ def evaluate(probed: ProbedObjective) -> tuple[dict[str, float], dict[str, float
         count += len(number)
         for name, value in logs.items():
             sums[name] += float(value) * len(number)
-    return {name: value / count for name, value in sums.items()}, errors.both(probed.data.states.std)
+    return {name: value / count for name, value in sums.items()}, errors.both(probed.data.std)
 
 
 @torch.no_grad()
@@ -281,52 +276,44 @@ def encode(probed: ProbedObjective, number: Tensor, length: int | None = None) -
 
 def refitted_errors(probed: ProbedObjective) -> tuple[StateProbe, dict[str, dict[str, float]]]:
     """A probe fitted on frozen representations of training windows, and its errors by split."""
-    config, states = probed.config, probed.data.states
+    config, data = probed.config, probed.data
     probed.objective.eval()
-    parts = [encode(probed, number) for number in probed.data.spread(config.refit_windows, held_out=False)]
+    parts = [encode(probed, number) for number in data.spread(config.refit_windows, held_out=False)]
     features, rows = (torch.cat([part[i][:, config.burn_in :].flatten(0, 1) for part in parts]) for i in (0, 1))
-    probe = refit(features, states.values[rows], config.refit_steps, config.seed)
+    probe = refit(features, data.states[rows], config.refit_steps, config.seed)
     found = {}
     for split, held_out in (("training", False), ("held_out", True)):
         errors = ErrorSums()
-        for number in probed.data.spread(config.evaluation_windows, held_out):
+        for number in data.spread(config.evaluation_windows, held_out):
             past, at = encode(probed, number)
-            errors.add(probe(past), states.values[at], states.hidden[at], config.burn_in)
-        found[split] = errors.both(states.std)
+            errors.add(probe(past), data.states[at], data.hidden[at], config.burn_in)
+        found[split] = errors.both(data.std)
     return probe, found
 
 
 def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
-    """The refitted probe, and all rows of `results.json`; `log` is the run's metrics.jsonl."""
+    """The refitted probe, and all rows of `results.json`; `log` is the run's metrics.jsonl.
+
+    Action losses are in nats x 100, as in the paper's table; k = 0 is the mean over all pairs.
+    """
     probe, refitted = refitted_errors(probed)
+    found = [(split, "refit", errors) for split, errors in refitted.items()]
+    if probed.config.method != UNTRAINED:  # neither its online probe nor its action head was trained
+        losses, online = evaluate(probed)
+        averages = _training_averages(log, probed.config)
+        found += [("held_out", "online", online), ("training", "online", averages)]
+        if "action_loss" in losses:
+            found += [("training", "", averages), ("held_out", "", losses)]
     values: dict[Measure, float] = {}
-    for split, errors in refitted.items():
-        values |= _errors(split, "refit", errors)
-    if probed.config.method == UNTRAINED:  # neither its online probe nor its action head was trained
-        return probe, measure_rows(values)
-    losses, online = evaluate(probed)
-    averages = _training_averages(log, probed.config)
-    values |= _errors("held_out", "online", online) | _errors("training", "online", averages)
-    if "action_loss" in losses:
-        values |= _losses("training", averages) | _losses("held_out", losses)
-    return probe, measure_rows(values)
-
-
-def _errors(split: str, probe: str, logs: dict[str, float]) -> dict[Measure, float]:
-    """Error measures among logged numbers, by the names of `ErrorSums.both`."""
-    values = {}
-    for name, value in logs.items():
-        error = name.removesuffix("_hidden")
-        if error.removeprefix(RAW_PREFIX) in COMPONENTS:
-            rows = "hidden" if name.endswith("_hidden") else "all"
-            values[Measure(f"{error}_error", split, probe, rows)] = value
-    return values
-
-
-def _losses(split: str, logs: dict[str, float]) -> dict[Measure, float]:
-    """Action losses in nats x 100, as in the paper's table; k = 0 is the mean over all pairs."""
-    by_k = {0: logs["action_loss"]} | {int(n[6:]): v for n, v in logs.items() if n.startswith("loss_k")}
-    return {Measure("action_loss", split, "", k=k): 100 * value for k, value in by_k.items()}
+    for split, estimator, logs in found:
+        for name, value in logs.items():
+            error, rows = name.removesuffix("_hidden"), "hidden" if name.endswith("_hidden") else "all"
+            if estimator and error.removeprefix(RAW_PREFIX) in COMPONENTS:
+                values[Measure(f"{error}_error", split, estimator, rows)] = value
+        if not estimator:
+            by_k = {0: logs["action_loss"]} | {int(n[6:]): loss for n, loss in logs.items() if n.startswith("loss_k")}
+            values |= {Measure("action_loss", split, "", k=k): 100 * loss for k, loss in by_k.items()}
+    return probe, [measure._asdict() | {"value": value} for measure, value in values.items()]
 
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
@@ -345,16 +332,15 @@ def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]
 
 def write_trajectory(path: Path, probed: ProbedObjective, probe: StateProbe) -> None:
     """Write true and estimated states of the first held-out trajectory, encoded as one sequence."""
-    dataset, states = probed.data.dataset, probed.data.states
+    data, dataset = probed.data, probed.data.dataset
     length = min(TRAJECTORY_ROWS, int((dataset.episode_end - dataset.episode_start).min()))
-    first = int(dataset.windows_per_episode(length)[: probed.data.first_held_out].sum())
+    first = int(dataset.windows_per_episode(length)[: data.first_held_out].sum())
     past, rows = encode(probed, torch.tensor([first]), length)
-    estimate = (probe(past)[0].detach() * states.std + states.mean).cpu()
-    truth = (states.values[rows[0]] * states.std + states.mean).cpu()
+    estimate, truth = ((z * data.std + data.mean).cpu() for z in (probe(past)[0].detach(), data.states[rows[0]]))
     with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = ("x", "y", "vx", "vy")
         writer.writerow(["t", *names, *(f"estimated_{name}" for name in names), "hidden"])
-        for t, hidden in enumerate(states.hidden[rows[0]].tolist()):
+        for t, hidden in enumerate(data.hidden[rows[0]].tolist()):
             numbers = [*truth[t].tolist(), *estimate[t].tolist()]
             writer.writerow([t, *(f"{number:.5f}" for number in numbers), int(hidden)])

@@ -15,7 +15,7 @@ from torch import Tensor
 from vd4rl_pomdp.core.errors import UserError, refuse_unknown
 from vd4rl_pomdp.core.types import Windows, previous, row_key
 from vd4rl_pomdp.envs import Info
-from vd4rl_pomdp.studies.theory.law import Law, joint_law
+from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.world import WORLDS, World
 
 
@@ -82,24 +82,19 @@ class ExactWindows:
 
     def draw(self, count: int, generator: torch.Generator) -> Windows:
         """A batch of `count` windows, drawn by probability."""
-        fields = self.windows.keys()
         index = torch.multinomial(self.probability, count, replacement=True, generator=generator)
-        return self.windows.replace(**{name: self.windows[name][index] for name in fields})
-
-
-def one_hot(index: np.ndarray, count: int) -> np.ndarray:
-    """Indices (...) to one-hot (..., count) float32."""
-    return np.eye(count, dtype=np.float32)[index]
+        return self.windows.replace(**{name: self.windows[name][index] for name in self.windows})
 
 
 def exact_windows(world: World, rows: int) -> ExactWindows:
     """All sequences from a world's initial distribution; windows end within their episode, as in training."""
     law = joint_law(world, [(kind, j) for kind in ("s", "o", "a") for j in range(rows)])
-    obs = one_hot(_codes(law, "o", rows), len(world.symbols))
-    action = torch.from_numpy(one_hot(_codes(law, "a", rows), len(world.actions)))
+    shown, acted, state = (np.stack([law.column((kind, j)) for j in range(rows)], axis=1) for kind in ("o", "a", "s"))
+    obs = torch.from_numpy(255 * np.eye(len(world.symbols), dtype=np.uint8)[shown])
+    action = torch.from_numpy(np.eye(len(world.actions), dtype=np.float32)[acted])
     count = len(law.counts)
     windows = Windows(
-        obs=torch.from_numpy((obs * 255).astype(np.uint8))[..., None, None],
+        obs=obs[..., None, None],
         prev_action=previous(action),
         action=action,
         has_action=torch.ones(count, rows, dtype=torch.bool),
@@ -108,9 +103,4 @@ def exact_windows(world: World, rows: int) -> ExactWindows:
     )
     weights = law.counts.astype(object)
     probability = torch.tensor([float(p) for p in weights / sum(weights)], dtype=torch.float64)
-    return ExactWindows(windows, probability, torch.from_numpy(_codes(law, "s", rows)))
-
-
-def _codes(law: Law, kind: str, rows: int) -> np.ndarray:
-    """(N, rows) int64 codes of one kind of variable."""
-    return np.stack([law.column((kind, j)) for j in range(rows)], axis=1)
+    return ExactWindows(windows, probability, torch.from_numpy(state))

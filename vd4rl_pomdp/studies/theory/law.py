@@ -117,15 +117,42 @@ def joint_law(world: World, variables: Iterable[Variable]) -> Law:
     """Exact joint distribution of some variables of a sequence that starts in the world's initial distribution."""
     wanted = in_order(set(variables))
     rows = 1 + max(row for _, row in wanted)
-    walk = _Walk(world, rows)
+    step, initial, policy, drift, emission = _tables(world)
+    total = initial.total * (policy.total * drift.total * emission.total) ** rows
+    counts = initial.weights[0].astype(np.int64 if total < LARGEST else object)
+    columns = list(np.divmod(initial.entries[0], len(world.exogenous)))  # the current pair, then the recorded ones
+
+    def branch(table: _Table, row: np.ndarray) -> None:
+        """Branch every sequence over the outcomes of its table row, which become another column."""
+        nonlocal counts
+        weights = table.weights.astype(counts.dtype)
+        parent, nth = np.nonzero(weights[row])
+        columns[:] = [*(column[parent] for column in columns), table.entries[row[parent], nth]]
+        counts = counts[parent] * weights[row[parent], nth]
+
+    def merge(keys: list[np.ndarray]) -> None:
+        """Merge sequences with equal keys by adding their counts."""
+        nonlocal counts
+        ids, first = number_rows(keys)
+        before, counts = counts, np.zeros(len(first), counts.dtype)
+        np.add.at(counts, ids, before)
+        columns[:] = [column[first] for column in columns]
+
     for row in range(rows):
         kinds = {kind for kind, j in wanted if j == row}
-        walk.keep(kinds)
+        columns += [columns[i] for i, kind in enumerate(("s", "xi")) if kind in kinds]
+        if "o" in kinds:
+            branch(emission, columns[0] * len(world.exogenous) + columns[1])
         if row < rows - 1 or "a" in kinds:
-            walk.act("a" in kinds)
-    walk.merge(walk.columns)  # sums out the last pair
+            branch(policy, columns[0])
+            action = columns[-1] if "a" in kinds else columns.pop()
+            columns[0] = step[columns[0], action]
+            branch(drift, columns[1])
+            columns[1] = columns.pop()
+            merge([*columns[2:], *columns[:2]])
+    merge(columns[2:])  # sums out the last pair
     names = {"s": world.states, "xi": world.exogenous, "o": world.symbols, "a": world.actions}
-    return Law(tuple(wanted), np.stack(walk.columns, 1), walk.counts, names)
+    return Law(tuple(wanted), np.stack(columns[2:], 1), counts, names)
 
 
 class _Table:
@@ -156,50 +183,6 @@ def _tables(world: World) -> tuple[np.ndarray, _Table, _Table, _Table, _Table]:
         _Table([world.drift[xi] for xi in noises], noises),
         _Table([world.emission[pair] for pair in pairs], world.symbols),
     )
-
-
-class _Walk:
-    """All sequences so far: recorded columns, current pair, and counts."""
-
-    def __init__(self, world: World, rows: int) -> None:
-        self.step, initial, self.policy, self.drift, self.emission = _tables(world)
-        total = initial.total * (self.policy.total * self.drift.total * self.emission.total) ** rows
-        self.counts = initial.weights[0].astype(np.int64 if total < LARGEST else object)
-        self.noises = len(world.exogenous)
-        self.s, self.xi = np.divmod(initial.entries[0], self.noises)
-        self.columns: list[np.ndarray] = []
-
-    def keep(self, kinds: set[str]) -> None:
-        """Record the wanted ones of a row's s, xi and o."""
-        self.columns += [self.s] * ("s" in kinds) + [self.xi] * ("xi" in kinds)
-        if "o" in kinds:
-            symbol = self._branch(self.emission, self.s * self.noises + self.xi)
-            self.columns.append(symbol)
-
-    def act(self, wanted: bool) -> None:
-        """Take every action, recorded if wanted, and merge sequences that have become equal."""
-        action = self._branch(self.policy, self.s)
-        self.s = self.step[self.s, action]
-        self.columns += [action] * wanted
-        self.xi = self._branch(self.drift, self.xi)
-        self.merge([*self.columns, self.s, self.xi])
-
-    def _branch(self, table: _Table, row: np.ndarray) -> np.ndarray:
-        """Branch every sequence over the outcomes of its table row; returns the outcomes."""
-        weights = table.weights.astype(self.counts.dtype)
-        parent, nth = np.nonzero(weights[row])
-        self.columns = [column[parent] for column in self.columns]
-        self.s, self.xi, row = self.s[parent], self.xi[parent], row[parent]
-        self.counts = self.counts[parent] * weights[row, nth]
-        return table.entries[row, nth]
-
-    def merge(self, keys: list[np.ndarray]) -> None:
-        """Merge sequences with equal keys by adding their counts."""
-        ids, first = number_rows(keys)
-        counts = np.zeros(len(first), self.counts.dtype)
-        np.add.at(counts, ids, self.counts)
-        self.columns = [column[first] for column in self.columns]
-        self.s, self.xi, self.counts = self.s[first], self.xi[first], counts
 
 
 def number_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ future with its own encoder). Every refinement of a sufficient phi is sufficient
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from functools import cached_property
 from itertools import combinations
@@ -41,7 +41,8 @@ class Relation:
         self._contents: dict[tuple, int] = {}
         self._predictions: dict[Prediction, int] = {}
         self._entries: list[np.ndarray] = []
-        self._facts: dict[str, list[np.ndarray]] = {"s": [], "xi": [], "content": []}
+        self.facts: dict[str, list[np.ndarray]] = {"s": [], "xi": [], "content": []}
+        """Parts of (P, 2): each history with each possible agent-centric state, exogenous state and content."""
 
     def add(self, law: Law, start: Iterable[Variable], end: Iterable[Variable], t: int, k: int) -> None:
         """Record F_k from a law of both views and a_t."""
@@ -64,7 +65,7 @@ class Relation:
         told = {kind: law.column((kind, row)) for kind in ("s", "xi")}
         told["content"] = _numbers(self._contents, content, law)
         for kind, values in told.items():
-            self._facts[kind].append(np.unique(np.stack([history, values], axis=1), axis=0))
+            self.facts[kind].append(np.unique(np.stack([history, values], axis=1), axis=0))
         numbers, first = np.unique(history, return_index=True)
         acted = law.values([v for v in past if v[0] == "a"], first)
         self.acted.update(zip(numbers.tolist(), acted, strict=True))
@@ -84,14 +85,9 @@ class Relation:
         """(H, X) bool: possible final exogenous states of a history."""
         return self._incidence("xi", len(self.world.exogenous))
 
-    @cached_property
-    def contents(self) -> np.ndarray:
-        """(P, 2): each history with each possible agent-centric content."""
-        return np.concatenate(self._facts["content"])
-
     def _incidence(self, kind: str, width: int) -> np.ndarray:
         table = np.zeros((len(self.histories), width), bool)
-        table[tuple(np.concatenate(self._facts[kind]).T)] = True
+        table[tuple(np.concatenate(self.facts[kind]).T)] = True
         return table
 
     def conflicts(self) -> np.ndarray:
@@ -101,20 +97,15 @@ class Relation:
         _mark_differing(found, past, number_rows([k, later])[0], value)
         if self.shared:
             _mark_differing(found, later, number_rows([k, past])[0], value)
-            for each in np.unique(k):
-                found |= self._contradict_as_one(self.entries[1:, k == each])
+            for each in np.unique(k):  # merged, two histories would need several predictions for one pair
+                table = np.full(found.shape, -1, np.int32)
+                table[past[k == each], later[k == each]] = value[k == each]
+                loop = table.diagonal()
+                low, high = np.full_like(table, len(self._predictions)), table
+                for other in (table, table.T, loop[:, None], loop):
+                    low, high = np.where(other < 0, low, np.minimum(low, other)), np.maximum(high, other)
+                found |= low < high
         return found | found.T
-
-    def _contradict_as_one(self, entries: np.ndarray) -> np.ndarray:
-        """(H, H): pairs of histories that cannot be merged, as some pair would need several predictions at this k."""
-        past, later, value = entries
-        table = np.full((len(self.histories),) * 2, -1, np.int32)
-        table[past, later] = value
-        loop = table.diagonal()
-        low, high = np.full_like(table, len(self._predictions)), table
-        for other in (table, table.T, loop[:, None], loop):
-            low, high = np.where(other < 0, low, np.minimum(low, other)), np.maximum(high, other)
-        return low < high
 
     def factors(self, codes: np.ndarray) -> bool:
         """Whether F is a function of both sides' codes; codes (H,) integers."""
@@ -131,64 +122,43 @@ class Relation:
         return min(found, key=lambda blocks: len(set(blocks)))
 
     def _first_fit(self, groups: Sequence[str], ends: Sequence[str]) -> np.ndarray:
-        """Blocks by first fit: first within groups (equal states, or equal actions), then across them."""
-        texts = [repr(history) for history in self.histories]
-        order = sorted(range(len(texts)), key=lambda h: (groups[h], ends[h], texts[h]))
-        blocks = _Blocks(self._tables(), self.shared)
-        heads = blocks.join(order, lambda a, b: groups[a] == groups[b])
-        blocks.join(heads, lambda a, b: True)
-        return np.unique([blocks.find(h) for h in range(len(texts))], return_inverse=True)[1]
+        """Blocks by first fit: first within groups (equal states, or equal actions), then across them.
 
-    def _tables(self) -> np.ndarray:
-        """(K, H, L): prediction for every k, history and other side, -1 for pairs that never occur."""
+        A block is named by its first member, which keeps its row of the tables of F, (K, H, L): prediction for every k,
+        history and other side, -1 for pairs that never occur.
+        """
         k, past, later, value = self.entries
         place = np.unique(k, return_inverse=True)[1]
         tables = np.full((int(place.max()) + 1, len(self.histories), len(self._laters)), -1)
         tables[place, past, later] = value
-        return tables
+        parent = np.arange(len(self.histories))
 
+        def fit(one: int, other: int) -> bool:
+            both = [one, other]
+            if _differ(tables[:, both], axis=1):
+                return False
+            if not self.shared:
+                return True
+            between = tables[:, both][:, :, both].reshape(len(tables), 4)
+            return not (_differ(tables[:, :, both], axis=2) or _differ(between, axis=1))
 
-class _Blocks:
-    """Union-find over blocks of histories, named by their first member, with the tables of F between blocks."""
+        def join(order: Iterable[int], within: bool) -> list[int]:
+            """Merge every block, in order, into the first earlier one that is allowed and fits; returns the others."""
+            heads: list[int] = []
+            for name in order:
+                mates = (h for h in heads if (not within or groups[h] == groups[name]) and fit(h, name))
+                if (head := next(mates, None)) is None:
+                    heads.append(name)
+                    continue
+                parent[parent == name] = head
+                for side in (tables, tables.swapaxes(1, 2)) if self.shared else (tables,):
+                    side[:, head] = np.maximum(side[:, head], side[:, name])  # where both have an entry, they are equal
+                    side[:, name] = -1
+            return heads
 
-    def __init__(self, tables: np.ndarray, shared: bool) -> None:
-        self.tables, self.shared = tables, shared
-        self.parent = list(range(tables.shape[1]))
-
-    def find(self, name: int) -> int:
-        """The block of a history."""
-        while self.parent[name] != name:
-            name = self.parent[name]
-        return name
-
-    def join(self, order: Iterable[int], allowed: Callable[[int, int], bool]) -> list[int]:
-        """Merge every block, in order, into the first earlier block that is allowed and fits; returns the remaining
-        ones."""
-        heads: list[int] = []
-        for name in order:
-            head = next((h for h in heads if allowed(h, name) and self.fit(h, name)), None)
-            if head is None:
-                heads.append(name)
-            else:
-                self._merge(head, name)
-        return heads
-
-    def fit(self, one: int, other: int) -> bool:
-        """Whether merging two blocks causes no contradiction."""
-        both = [one, other]
-        if _differ(self.tables[:, both], axis=1):
-            return False
-        if not self.shared:
-            return True
-        between = self.tables[:, both][:, :, both].reshape(len(self.tables), 4)
-        return not (_differ(self.tables[:, :, both], axis=2) or _differ(between, axis=1))
-
-    def _merge(self, head: int, name: int) -> None:
-        """Merge a block's entries into another's; where both have one, they are equal."""
-        self.parent[name] = head
-        for side in (self.tables, self.tables.swapaxes(1, 2)) if self.shared else (self.tables,):
-            side[:, head] = np.maximum(side[:, head], side[:, name])
-            side[:, name] = -1
+        texts = [repr(history) for history in self.histories]
+        join(join(sorted(range(len(texts)), key=lambda h: (groups[h], ends[h], texts[h])), within=True), within=False)
+        return np.unique(parent, return_inverse=True)[1]
 
 
 def _differ(values: np.ndarray, axis: int) -> bool:
@@ -262,7 +232,7 @@ def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
 
 def discards_noise(found: Relation) -> bool:
     """Whether F depends only on the agent-centric content of histories, so that noise can be discarded."""
-    return found.factors(_linked(found.contents))
+    return found.factors(_linked(np.concatenate(found.facts["content"])))
 
 
 def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:

@@ -48,6 +48,17 @@ class World:
     emission: dict[JointState, Distribution]
     policy: dict[AgentState, Distribution]
 
+    def __post_init__(self) -> None:
+        reached = self.reachable()
+        for kind, names, found in (
+            ("state", self.states, {s for s, _ in reached}),
+            ("exogenous state", self.exogenous, {xi for _, xi in reached}),
+        ):
+            if lost := [name for name in names if name not in found]:
+                raise UserError(
+                    f"world {self.name!r}: {kind} {lost[0]} is unreachable from the initial law: drop or connect it"
+                )
+
     @property
     def symbols(self) -> tuple[Symbol, ...]:
         """All observations that can be emitted, in a fixed order."""
@@ -92,24 +103,25 @@ def finite_world(
     if not (states and exogenous and actions):
         raise UserError(f"world {name!r}: needs at least one state, one exogenous state and one action")
     pairs = [(s, xi) for s in states for xi in exogenous]
-    initial = uniform(pairs) if initial is None else initial
-    after = {(s, a): step(s, a) for s in states for a in actions}
-    for (s, a), state in after.items():
-        _check_declared(name, f"step({s}, {a})", state, states)
     choose = policy or (lambda s, xi: uniform(actions))
-    world = World(
+    rows = {s: [_law(name, f"policy({s}, {xi})", choose(s, xi), actions) for xi in exogenous] for s in states}
+    for s, found in rows.items():
+        if differ := [xi for xi, row in zip(exogenous, found, strict=True) if row != found[0]]:
+            raise UserError(
+                f"world {name!r}: the policy reads the exogenous part (at state {s} it differs between "
+                f"{exogenous[0]} and {differ[0]}): make it depend on the agent-centric state alone"
+            )
+    return World(
         name,
         states,
         exogenous,
         actions,
-        _law(name, "initial", initial, pairs),
-        after,
+        _law(name, "initial", uniform(pairs) if initial is None else initial, pairs),
+        {(s, a): next(iter(_law(name, f"step({s}, {a})", {step(s, a): 1}, states))) for s in states for a in actions},
         {xi: _law(name, f"drift({xi})", drift(xi), exogenous) for xi in exogenous},
-        {(s, xi): _law(name, f"emit({s}, {xi})", emit(s, xi), None) for s, xi in pairs},
-        {s: _agent_centric(name, s, exogenous, actions, choose) for s in states},
+        {(s, xi): _law(name, f"emit({s}, {xi})", emit(s, xi)) for s, xi in pairs},
+        {s: row[0] for s, row in rows.items()},
     )
-    _all_reached(world)
-    return world
 
 
 def uniform(items: Iterable[Any]) -> Distribution:
@@ -118,89 +130,25 @@ def uniform(items: Iterable[Any]) -> Distribution:
     return {item: Fraction(1, len(items)) for item in items}
 
 
-def with_policy(world: World, name: str, policy: Callable[[Any], Mapping[Action, Any]]) -> World:
-    """The same world with another agent-centric policy."""
-    table = {s: _law(world.name, f"policy({s})", policy(s), world.actions) for s in world.states}
-    changed = replace(world, name=f"{world.name}, {name}", policy=table)
-    _all_reached(changed)
-    return changed
-
-
-def with_noise(world: World, name: str, noise: Mapping[Exogenous, Distribution]) -> World:
-    """The world with a second exogenous chain (a transition table) that is appended to every observation."""
-    noise = {xi: _law(world.name, f"noise({xi})", row, noise) for xi, row in noise.items()}
-    share = Fraction(1, len(noise))
-    return replace(
-        world,
-        name=f"{world.name}, {name}",
-        exogenous=tuple((xi, e) for xi in world.exogenous for e in noise),
-        initial={(s, (xi, e)): p * share for (s, xi), p in world.initial.items() for e in noise},
-        drift={(xi, e): _product(row, noise[e]) for xi, row in world.drift.items() for e in noise},
-        emission={
-            (s, (xi, e)): _product(row, {e: Fraction(1)}) for (s, xi), row in world.emission.items() for e in noise
-        },
-    )
-
-
-def _product(one: Distribution, other: Distribution) -> Distribution:
-    return {(a, b): p * q for a, p in one.items() for b, q in other.items()}
-
-
-def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] | None) -> Distribution:
+def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] | None = None) -> Distribution:
     """A distribution as fractions, without zeros."""
-    law = {key: _fraction(name, where, value) for key, value in row.items()}
+    law: Distribution = {}
+    for key, value in row.items():
+        try:
+            law[key] = Fraction("" if isinstance(value, float) else value)
+        except (TypeError, ValueError, ZeroDivisionError):
+            raise UserError(
+                f"world {name!r}: {where} holds {value!r}: write probabilities as Fraction, int or '1/3', not float"
+            ) from None
     if any(p < 0 for p in law.values()):
         raise UserError(f"world {name!r}: {where} has a negative probability: every entry must be 0 or more")
     if sum(law.values()) != 1:
         raise UserError(f"world {name!r}: {where} sums to {sum(law.values())}, not to 1: correct that row")
-    for key in law:
-        if allowed is not None:
-            _check_declared(name, where, key, allowed)
+    if allowed is not None and (wrong := [key for key in law if key not in set(allowed)]):
+        raise UserError(
+            f"world {name!r}: {where} gives {wrong[0]!r}, which is not declared: add it or correct the entry"
+        )
     return {key: p for key, p in law.items() if p}
-
-
-def _fraction(name: str, where: str, value: Any) -> Fraction:
-    try:
-        if isinstance(value, int | Fraction | str):
-            return Fraction(value)
-    except (ValueError, ZeroDivisionError):
-        pass
-    raise UserError(
-        f"world {name!r}: {where} holds {value!r}: write probabilities as Fraction, int or '1/3', not float"
-    )
-
-
-def _check_declared(name: str, where: str, value: Any, allowed: Iterable[Any]) -> None:
-    """Raise UserError unless the world declares this value."""
-    if value not in set(allowed):
-        raise UserError(f"world {name!r}: {where} gives {value!r}, which is not declared: add it or correct the entry")
-
-
-def _agent_centric(
-    name: str, state: AgentState, exogenous: tuple, actions: tuple, policy: Callable[[Any, Any], Mapping[Action, Any]]
-) -> Distribution:
-    """The policy at one state, checked to be independent of the exogenous state."""
-    rows = [_law(name, f"policy({state}, {xi})", policy(state, xi), actions) for xi in exogenous]
-    for xi, row in zip(exogenous, rows, strict=True):
-        if row != rows[0]:
-            raise UserError(
-                f"world {name!r}: the policy reads the exogenous part (at state {state} it differs between "
-                f"{exogenous[0]} and {xi}): make it depend on the agent-centric state alone"
-            )
-    return rows[0]
-
-
-def _all_reached(world: World) -> None:
-    reached = world.reachable()
-    for kind, names, found in (
-        ("state", world.states, {s for s, _ in reached}),
-        ("exogenous state", world.exogenous, {xi for _, xi in reached}),
-    ):
-        lost = [name for name in names if name not in found]
-        if lost:
-            raise UserError(
-                f"world {world.name!r}: {kind} {lost[0]} is unreachable from the initial law: drop it or connect it"
-            )
 
 
 def distances(world: World, start: AgentState) -> dict[AgentState, int]:
@@ -238,7 +186,7 @@ no later one does. So the search for a memory length terminates without a bound,
 def past_memory(world: World, actions: bool) -> int | None:
     """Smallest m such that o_{t-m}..o_t (with a_{t-m}..a_{t-1}) determines s_t; None if there is none."""
     alike = _alike(world)
-    return _rows_needed(alike, lambda left: {after for c in left for after in _next(world, c, actions)} & alike)
+    return _rows_needed(alike, alike, lambda left: {after for c in left for after in _next(world, c, actions)} & alike)
 
 
 def future_memory(world: World, actions: bool, literal: bool = False) -> int | None:
@@ -250,18 +198,20 @@ def future_memory(world: World, actions: bool, literal: bool = False) -> int | N
     couples = _alike(world)
     if literal:
         pairs = world.reachable()
-        led = {after for c in product(pairs, pairs) for after in _next(world, c, actions)}
-        return _rows_needed(couples, lambda left: _that_go_on(world, left, actions), led)
-    going = {c for c in couples if any(_next(world, c, actions))}
-    return _rows_needed(going, lambda left: _that_go_on(world, left, actions))
+        judged = {after for c in product(pairs, pairs) for after in _next(world, c, actions)}
+    else:
+        judged = couples = {c for c in couples if any(_next(world, c, actions))}
+    return _rows_needed(
+        couples, judged, lambda left: {c for c in left if any(after in left for after in _next(world, c, actions))}
+    )
 
 
 def _rows_needed(
-    couples: set[Couple], with_one_more: Callable[[set[Couple]], set[Couple]], judged: set[Couple] | None = None
+    couples: set[Couple], judged: set[Couple], with_one_more: Callable[[set[Couple]], set[Couple]]
 ) -> int | None:
-    """Number of further rows until no couple has two different states; `judged` restricts the couples to check."""
+    """Number of further rows until no couple among those judged has two different states."""
     rows = 0
-    while any(one != other for (one, _), (other, _) in (couples if judged is None else couples & judged)):
+    while any(one != other for (one, _), (other, _) in couples & judged):
         fewer = with_one_more(couples)
         if fewer == couples:
             return None
@@ -273,11 +223,6 @@ def _alike(world: World) -> set[Couple]:
     """Couples of reachable pairs that can emit the same symbol."""
     pairs = world.reachable()
     return {(one, other) for one in pairs for other in pairs if world.emission[one].keys() & world.emission[other]}
-
-
-def _that_go_on(world: World, couples: set[Couple], actions: bool) -> set[Couple]:
-    """Couples with a successor in the same set."""
-    return {c for c in couples if any(after in couples for after in _next(world, c, actions))}
 
 
 def _next(world: World, couple: Couple, actions: bool) -> Iterator[Couple]:
@@ -292,8 +237,6 @@ def _next(world: World, couple: Couple, actions: bool) -> Iterator[Couple]:
 BLANK = "blank"
 """Uninformative observation."""
 HALF = Fraction(1, 2)
-NOISE: dict[Exogenous, Distribution] = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
-"""A lamp, appended to the observation, that turns on at a random time."""
 
 
 def counterexample(actions: tuple[int, int] = (-1, 1), every: int = 4) -> World:
@@ -351,34 +294,30 @@ def momentum() -> World:
     )
 
 
-def idle() -> World:
-    """Actions have no effect; observations are blank."""
-    return _tiny("idle", {0: (0, 0)}, {0: BLANK})
+TINY: dict[str, list[tuple[int, int, Symbol]]] = {
+    "idle": [(0, 0, BLANK)],  # actions have no effect; observations are blank
+    "switch": [(0, 1, 0), (0, 1, 1)],  # the state is the last action, and is observed
+    "hidden switch": [(0, 1, BLANK), (0, 1, BLANK)],  # the state is the last action; observations are blank
+    "toggle": [(0, 1, 0), (1, 0, 1)],  # action 1 switches sides, action 0 stays; the side is observed
+    "alternator": [(1, 1, 0), (0, 0, 1)],  # both actions switch sides; the side is observed
+    # action 1 climbs one step, action 0 and the top step lead to the ground; only the ground is observed
+    "ladder": [(0, 1, "ground"), (0, 2, BLANK), (0, 0, BLANK)],
+}
+"""Worlds without exogenous states: for each state the next ones after actions 0 and 1, and its observation."""
 
 
-def switch() -> World:
-    """The state is the last action, and is observed."""
-    return _tiny("switch", {0: (0, 1), 1: (0, 1)}, {0: 0, 1: 1})
-
-
-def hidden_switch() -> World:
-    """The state is the last action; observations are blank."""
-    return _tiny("hidden switch", {0: (0, 1), 1: (0, 1)}, {0: BLANK, 1: BLANK})
-
-
-def toggle() -> World:
-    """Action 1 switches sides, action 0 stays; the side is observed."""
-    return _tiny("toggle", {0: (0, 1), 1: (1, 0)}, {0: 0, 1: 1})
-
-
-def alternator() -> World:
-    """Both actions switch sides; the side is observed."""
-    return _tiny("alternator", {0: (1, 1), 1: (0, 0)}, {0: 0, 1: 1})
-
-
-def ladder() -> World:
-    """Action 1 climbs one step, action 0 and the top step lead to the ground; only the ground is observed."""
-    return _tiny("ladder", {0: (0, 1), 1: (0, 2), 2: (0, 0)}, {0: "ground", 1: BLANK, 2: BLANK})
+def tiny(name: str) -> World:
+    """A world of TINY."""
+    rows = TINY[name]
+    return finite_world(
+        name,
+        states=range(len(rows)),
+        exogenous=["-"],
+        actions=(0, 1),
+        step=lambda s, a: rows[s][a],
+        drift=lambda xi: {xi: 1},
+        emit=lambda s, xi: {rows[s][2]: 1},
+    )
 
 
 def flicker() -> World:
@@ -394,34 +333,39 @@ def flicker() -> World:
     )
 
 
-def _tiny(name: str, after: Mapping[int, tuple[int, int]], shown: Mapping[int, Symbol]) -> World:
-    """A world without exogenous states: next states after actions 0 and 1, and the observation of each state."""
-    return finite_world(
-        name,
-        states=list(after),
-        exogenous=["-"],
-        actions=(0, 1),
-        step=lambda s, a: after[s][a],
-        drift=lambda xi: {xi: 1},
-        emit=lambda s, xi: {shown[s]: 1},
+WORLDS = {"counterexample": counterexample, "echo": echo, "momentum": momentum}
+
+
+def noisy(world: World) -> World:
+    """The world with a lamp, appended to every observation, that turns on at a random time."""
+    lamp: dict[Exogenous, Distribution] = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
+    return replace(
+        world,
+        name=f"{world.name}, noise",
+        exogenous=tuple((xi, e) for xi in world.exogenous for e in lamp),
+        initial={(s, (xi, e)): p * HALF for (s, xi), p in world.initial.items() for e in lamp},
+        drift={
+            (xi, e): {(a, b): p * q for a, p in row.items() for b, q in lamp[e].items()}
+            for xi, row in world.drift.items()
+            for e in lamp
+        },
+        emission={
+            (s, (xi, e)): {(o, e): p for o, p in row.items()} for (s, xi), row in world.emission.items() for e in lamp
+        },
     )
 
 
 def biased(world: World) -> World:
     """The world with a state-dependent policy: state i takes action i (mod their number) more often."""
     count = len(world.actions)
-
-    def policy(state: AgentState) -> dict:
-        liked = world.states.index(state) % count
-        return {a: Fraction(2 if i == liked else 1, count + 1) for i, a in enumerate(world.actions)}
-
-    return with_policy(world, "state-dependent policy", policy)
-
-
-WORLDS = {"counterexample": counterexample, "echo": echo, "momentum": momentum}
+    policy = {
+        s: {a: Fraction(1 + (j == i % count), count + 1) for j, a in enumerate(world.actions)}
+        for i, s in enumerate(world.states)
+    }
+    return replace(world, name=f"{world.name}, state-dependent policy", policy=policy)
 
 
 def variants(world: World) -> dict[tuple[bool, bool], World]:
     """The world with (noise, state-dependent policy) off and on."""
-    noisy = with_noise(world, "noise", NOISE)
-    return {(False, False): world, (True, False): noisy, (False, True): biased(world), (True, True): biased(noisy)}
+    shown = noisy(world)
+    return {(False, False): world, (True, False): shown, (False, True): biased(world), (True, True): biased(shown)}
