@@ -154,7 +154,7 @@ def path_error(
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     """Write how well the first view predicts the simulator state, if the task is known, states are stored, and an
     episode can be held out."""
-    if dataset.physics is None or dataset.task not in TASKS or dataset.num_episodes < 2:
+    if dataset.physics is None or dataset.num_episodes < 2 or dataset.task is None or dataset.task not in TASKS:
         return
     if (run.path / PROBE_FILE).exists():
         tell_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))

@@ -238,3 +238,10 @@ def test_a_gate_that_one_algorithm_misses_says_nothing_of_another(tmp_path, caps
     for shown in (re.sub(r"</td>\s*<td>", ": ", report.page.read_text()), " ".join(capsys.readouterr().out.split())):
         assert "walker_walk expert, patch, iql: undecided at this budget: acro under none" in shown
         assert "walker_walk expert, patch: discriminates" in shown
+
+
+def test_methods_are_listed_by_name_where_every_algorithm_misses_a_gate(tmp_path):
+    for algorithm in ("td3_bc", "iql"):
+        grid(tmp_path / "runs", GOOD | {("acro", "none"): (9, 9)}, algorithm=algorithm)
+    summary = write_report([tmp_path / "runs"], tmp_path / "out").summary
+    assert methods(summary)[:3] == ["acro", "acro", "mik+a"]

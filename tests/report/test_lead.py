@@ -1,5 +1,6 @@
 """MIK+A's lead against the budget of pretraining, on runs whose returns are given."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from tests.helpers_report import describe, write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.gates import leads
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 800.0
 LEAD, OVER_GRU = "mik+a less acro", "mik+a less acro with a GRU"
@@ -85,3 +87,15 @@ def test_the_page_shows_leads_and_what_is_missing(runs, tmp_path, figure_files):
     table = pd.read_csv(tmp_path / "out" / "lead.csv")
     assert table["difference"].isna().tolist() == [False, False, False, True]
     assert (tmp_path / "out" / "figures" / "lead_patch.png").exists()
+
+
+def test_sides_on_a_set_a_seed_are_compared_seed_by_seed_or_not(runs):
+    """Each seed's set is its own, and a side may lack a seed."""
+    for run in runs.iterdir():
+        seed = read_json(run / "config.json")["config"]["seed"]
+        made = {"inputs": {"data": f"{seed}" * 24}, "collection": {"task": "walker_walk", "seed": 100 + seed}}
+        write_json(run / "config.json", read_json(run / "config.json") | made)
+    assert found(runs)[LEAD, 3000]["difference"] == pytest.approx(10.0)
+    shutil.rmtree(next(runs.glob("mik+a-patch-0-*-3000-*")))
+    row = found(runs)[LEAD, 3000]
+    assert (row["difference"], row["left_seeds"], row["low"]) == (pytest.approx(55 - 42.5), 1, None)

@@ -86,7 +86,7 @@ def action_error(action: np.ndarray, shown: np.ndarray) -> np.floating:
 def _sole_actor(dataset: Dataset) -> dict[str, str] | None:
     """The shipped actor that collected all shards; None if there is no such single actor."""
     hashes = {one.get("actor_sha256") for one in dataset.store.meta["attributes"]}
-    if len(hashes) != 1 or dataset.task not in TASKS:
+    if len(hashes) != 1 or dataset.task is None or dataset.task not in TASKS:
         return None
     sha256 = str(hashes.pop())
     for quality in ("medium", "expert"):
