@@ -109,7 +109,7 @@ def test_a_run_is_resumed_from_all_it_had_and_another_starts_from_its_export(tra
     training.train_actor(replace(config, decisions=120))
     steps = [step for step, _ in exporting.read_curve(config.out)]
     assert steps == [40, 80, 120], "what no checkpoint has is forgotten"
-    with pytest.raises(UserError, match="another n_step"):
+    with pytest.raises(UserError, match="differs in n_step"):
         training.train_actor(replace(config, n_step=1))
 
     kept = tmp_path / "kept"

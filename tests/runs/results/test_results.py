@@ -277,7 +277,7 @@ def test_results_go_into_no_folder_of_another_kind(tmp_path):
 def test_committed_runs_say_what_they_were_made_with(place):
     for run in read_results(place.parent):
         assert run.settled
-        learns_no_actions = run.record["config"].get("method") in ("random", "supervised+a")
+        learns_no_actions = run.record["config"].get("method") in ("random", "state", "supervised+a")
         assert run.measured or run.losses or learns_no_actions
         assert run.labels["task"]
         assert run.record["command"]
