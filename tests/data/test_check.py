@@ -69,9 +69,9 @@ def test_a_replay_that_gives_no_number_is_not_exact(folder, tmp_path):
     [
         (0, "action", 0.5, "an episode's first row has a nonzero action or reward"),
         (0, "reward", 0.5, "an episode's first row has a nonzero action or reward"),
-        (1, "action", np.nextafter(np.float32(1), np.float32(2)), r"has actions up to 1\.0000001: scale them"),
+        (1, "action", np.nextafter(np.float32(1), np.float32(2)), r"has actions of up to 1\.0000001: scale them"),
         (1, "discount", np.nextafter(1.0, 2.0), r"'discount' is 1\.0000000000000002 in row 1, not within 0 and 1"),
-        (1, "action", -1.5, r"has actions up to 1.5: scale them to \[-1, 1\]"),
+        (1, "action", -1.5, r"has actions of up to 1.5: scale them to \[-1, 1\]"),
     ],
 )
 def test_what_can_be_no_action_is_refused(tmp_path, row, key, value, told):

@@ -94,7 +94,7 @@ def _check_actions(dataset: Dataset) -> None:
             "follows it, and zeros in the first row"
         )
     if (most := np.abs(action).max()) > 1:
-        raise UserError(f"{dataset.path}: has actions up to {most!s}: scale them to [-1, 1], as policies act")
+        raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], as policies act")
 
 
 def _why_not_replayed(dataset: Dataset) -> str:
