@@ -141,6 +141,11 @@ def _alike(asked: _Asked) -> list[tuple[str, Any]]:
     return [(flag_of(name), value) for name, value in settings.items()] + widths
 
 
+ONE_THREAD_UNITS = 512
+"""Up to this width, one CPU thread updates a single policy on cached features at least as fast as several, which wait
+for each other between small products."""
+
+
 class Updates:
     """Updates of one run or a stack, replayed as CUDA graphs on a GPU."""
 
@@ -165,10 +170,18 @@ class Updates:
         self._replay = Replay(self._update, device, streams, self._counting.period, trained)
         if self._replay.replays:
             self._counting.count_on(device)
+        settings = trainers[0].config
+        small = settings.views > 0 and settings.hidden_dim <= ONE_THREAD_UNITS and len(trainers) == 1
+        self._one_thread = small and device.type == "cpu"
 
     def __call__(self, made: int) -> dict[str, torch.Tensor]:
         """Do the update that follows `made` updates. Returns scalars, (S,) for a stack."""
-        return self._replay(made % self._counting.period)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1 if self._one_thread else threads)
+        try:
+            return self._replay(made % self._counting.period)
+        finally:
+            torch.set_num_threads(threads)
 
     def _update(self, turn: int) -> dict[str, torch.Tensor]:
         self._counting.take_turn(turn)

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from finetune import train, trainer
+from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FrozenEncoder
 from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
@@ -271,3 +272,24 @@ def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **changes))
     rows = list(csv.DictReader((run.path / "episodes.csv").open()))
     assert [row["evaluated_under"] for row in rows] == ["patch+zero_frames"]
+
+
+@pytest.mark.parametrize(("views", "hidden_dim", "threads"), [(1, 32, 1), (0, 32, 2), (1, 513, 2)])
+def test_small_networks_are_updated_by_one_thread(encoder, data, tmp_path, monkeypatch, views, hidden_dim, threads):
+    """Several would wait for each other between small products."""
+    seen, loss, before = set(), TD3BC.critic_loss, torch.get_num_threads()
+
+    def watched(self, *arguments):
+        seen.add(torch.get_num_threads())
+        return loss(self, *arguments)
+
+    monkeypatch.setattr(TD3BC, "critic_loss", watched)
+    monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
+    torch.set_num_threads(2)
+    try:
+        changes = BRIEF | {"views": views, "hidden_dim": hidden_dim, "batch_size": 4}
+        run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert seen == {threads}
