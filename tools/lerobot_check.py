@@ -10,9 +10,9 @@ pyarrow and av, since LeRobot requires other versions of torch. WORK must contai
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +77,7 @@ print(json.dumps(told))
 
 def main(work: Path) -> None:
     """Export, let LeRobot read and record, import."""
-    if {path.name for path in work.iterdir()} != {"venv"}:
+    if {path.name for path in work.glob("*")} != {"venv"}:
         raise SystemExit(f"{work} must hold LeRobot's environment `venv` and nothing else")
     rng, episodes = np.random.default_rng(0), []
     for steps in STEPS:
@@ -120,4 +120,6 @@ def main(work: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path, metavar="WORK")
+    main(parser.parse_args().work)
