@@ -176,10 +176,13 @@ class Updates:
 
     def __call__(self, made: int) -> dict[str, torch.Tensor]:
         """Do the update that follows `made` updates. Returns scalars, (S,) for a stack."""
+        turn = made % self._counting.period
+        if not self._one_thread:
+            return self._replay(turn)
         threads = torch.get_num_threads()
-        torch.set_num_threads(1 if self._one_thread else threads)
+        torch.set_num_threads(1)
         try:
-            return self._replay(made % self._counting.period)
+            return self._replay(turn)
         finally:
             torch.set_num_threads(threads)
 

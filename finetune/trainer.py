@@ -233,7 +233,7 @@ class FinetuneTrainer:
                 loop.require_finite(self.algorithm.encoder)
                 save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
             if not config.eval_episodes:
-                append_episodes(run.path / EPISODES_FILE, [])
+                append_episodes(run.path / EPISODES_FILE, [])  # a finished run has the file
                 return
             rows = [row for row in read_episodes(run.path / EPISODES_FILE) if row["step"] == self.step]
             played = Counter(row["evaluated_under"] for row in rows)
