@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from script import run_script, table
+from script import run_script
 
 from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.report.figures import looks_of, sheet, style
 from vd4rl_pomdp.report.stats import mean_and_error, number
 from vd4rl_pomdp.runs.critic import CONVERGED, VALUE, critic_of
@@ -197,7 +198,7 @@ def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
     head = ["set (data's return)", "policy", "best rung: return (updates)", "last rung: return (updates)"]
     head += ["the same, played clean", "critic converged at (updates)", "its value at the end; the data's own"]
     head += ["held-out cloning loss: lowest (updates), last", "last on episodes of the set, on batches"]
-    return table(head, rows, (0, 1))
+    return table_lines(head, rows, (0, 1))
 
 
 def _of(cell: Cell, rung: int) -> list[float]:
@@ -235,7 +236,7 @@ def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
                 line[rung] = text if text.startswith("-") else f"+{text}"
             rows.append((cell.key.setting, f"`mik+a` less {cell.key.called}", "return", line))
     shown = ((*words, *(line.get(rung, "") for rung in rungs)) for *words, line in rows)
-    return table(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), shown, (0, 1, 2))
+    return table_lines(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), shown, (0, 1, 2))
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
@@ -251,7 +252,7 @@ def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
         told += " so far" * bool(mine and missing)
         rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", told, missing or "all are there"))
     head = ("task", "units", "cells that count, of those asked for", "updates by the rule", "not run yet")
-    return table(head, rows, (0, 4))
+    return table_lines(head, rows, (0, 4))
 
 
 def figure(cells: Sequence[Cell]) -> Figure:

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from script import table
 
+from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.files import groups
@@ -85,7 +85,7 @@ def maze_lines(numbers: Numbers, maze: str) -> Iterator[str]:
         cells = [_cell(numbers, condition, one) for one in PAPERS_WAY]
         cells.append(", ".join(_mean(numbers, condition, one) for one in REFITTED))
         rows.append((_called(method), len(values(numbers, condition, REFITTED[0])), *cells))
-    return table(("", "seeds", "state", "position", "velocity", "state, position, velocity in %"), rows)
+    return table_lines(("", "seeds", "state", "position", "velocity", "state, position, velocity in %"), rows)
 
 
 def state_lines(numbers: Numbers, settings: Iterable[tuple[str, Condition]]) -> Iterator[str]:
@@ -108,7 +108,7 @@ def state_lines(numbers: Numbers, settings: Iterable[tuple[str, Condition]]) -> 
                     seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
                     cells = (_cell(numbers, condition, measure) for condition in conditions)
                     rows.append((f"{maze.replace('_', ' ')}, {told}", seeds, *cells))
-    return table(("", "seeds", *(f"`{name}`" for name in _ORDER)), rows)
+    return table_lines(("", "seeds", *(f"`{name}`" for name in _ORDER)), rows)
 
 
 def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
@@ -121,7 +121,7 @@ def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
         cells = (_cell(numbers, condition, one) for one in told for numbers in (usual, longer))
         rows.append((f"`{method}`, K = {k}", seeds, *cells))
     columns = (f"{words}, {steps} steps" for words in ("state error", "action loss") for steps in ("2,500", "20,000"))
-    return table(("", "seeds", *columns), rows)
+    return table_lines(("", "seeds", *columns), rows)
 
 
 def first_person_lines(numbers: Numbers) -> Iterator[str]:
@@ -137,7 +137,7 @@ def first_person_lines(numbers: Numbers) -> Iterator[str]:
     for name in sorted(filter(state.get, told), key=lambda one: np.mean(state[one])):
         cells = (", ".join(_cell(numbers, told[name], one) for one in part) for part in parts)
         rows.append((name, len(state[name]), *cells))
-    return table(("", "seeds", "state, position, velocity", "probe beside the model: position, velocity"), rows)
+    return table_lines(("", "seeds", "state, position, velocity", "probe beside the model: position, velocity"), rows)
 
 
 def first_rung_lines(numbers: Numbers) -> Iterator[str]:
@@ -145,7 +145,7 @@ def first_rung_lines(numbers: Numbers) -> Iterator[str]:
     methods = (*REFERENCES, "no_history", "mik+a", "ah+a")
     places = [(name, [Condition(maze, name) for maze in (STARS, COMPASS)]) for name in methods]
     rows = ((_called(name), *(_place_and_speed(numbers, one) for one in conditions)) for name, conditions in places)
-    return table(("", f"`{STARS}`", f"`{COMPASS}`"), rows)
+    return table_lines(("", f"`{STARS}`", f"`{COMPASS}`"), rows)
 
 
 def picture_lines(usual: Numbers) -> Iterator[str]:
@@ -162,7 +162,7 @@ def picture_lines(usual: Numbers) -> Iterator[str]:
         (words, *(_place_and_speed(numbers, Condition(STARS, name)) for name in methods))
         for words, numbers in settings.items()
     )
-    return table(("", *map(_called, methods)), rows)
+    return table_lines(("", *map(_called, methods)), rows)
 
 
 def hard_lines(numbers: Numbers) -> Iterator[str]:
@@ -173,4 +173,4 @@ def hard_lines(numbers: Numbers) -> Iterator[str]:
         if any(values(numbers, condition, REFITTED[1]) for condition in conditions):
             cells = [_place_and_speed(numbers, condition).replace("–, –", "–") for condition in conditions]
             rows.append((_called(method), *cells))
-    return table(("", *(f"`{maze}`" for maze in HARD)), rows)
+    return table_lines(("", *(f"`{maze}`" for maze in HARD)), rows)

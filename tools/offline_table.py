@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from scipy.stats import spearmanr
-from script import table
 
+from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.report import load
 from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
 from vd4rl_pomdp.report.load import PROBES, TOLD_STATES, Run, episodes_frame, load_runs, runs_frame
@@ -101,7 +101,7 @@ def return_lines(runs: Sequence[Run]) -> Iterator[str]:
         name = f"{SETS[place]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
         rows.append((name + ", exploratory" * (place[1] in EXPLORATORY), *cells, _told(_of(here, "acro", CLEAN))))
     shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
-    return table(("set (data's return)", *shown, "`acro` trained with nothing hidden"), rows)
+    return table_lines(("set (data's return)", *shown, "`acro` trained with nothing hidden"), rows)
 
 
 def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -118,7 +118,7 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
             if any(cell != number(None) for cell in cells):
                 cells[-1] += f" (`{other}`)" * (cells[-1] != number(None))
                 rows.append((_name(*place, corruption), words, *cells))
-    return table(("set", "played", *CONTRASTS, "`mik+a` less the best other"), rows, (0, 1))
+    return table_lines(("set", "played", *CONTRASTS, "`mik+a` less the best other"), rows, (0, 1))
 
 
 def _told(runs: list[Run]) -> str:
@@ -168,7 +168,9 @@ def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
             known = row["method"] in above.index
             chance = above.loc[row["method"], ["probability", "low", "high"]] if known else [None] * 3
             rows.append((f"{row['tasks']} {kind}", f"`{row['method']}`", *cells, with_interval(*chance, 2)))
-    return table(("sets", "method", "interquartile mean", "mean", "chance that `mik+a` ends above it"), rows, (0, 1))
+    return table_lines(
+        ("sets", "method", "interquartile mean", "mean", "chance that `mik+a` ends above it"), rows, (0, 1)
+    )
 
 
 def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -181,7 +183,7 @@ def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
         above = with_interval(row["above_random"], row["low"], row["high"], 0)
         rows.append((row["name"], f"{row['data_return']:.0f}", *shares, above, row["passed"]))
     shares = ("`state`, of it", "`acro` with nothing hidden, of it", "its bar (published score)", "best of it")
-    return table(("set", "data's return", *shares, "best less `random`", "passed"), rows, (0, 7))
+    return table_lines(("set", "data's return", *shares, "best less `random`", "passed"), rows, (0, 7))
 
 
 def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -194,7 +196,7 @@ def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
         trained = probed[probed["method"] != UNTRAINED]
         cells = (f"{_rank_correlation(probed, name)}, {_rank_correlation(trained, name)}" for name in GOING_WITH)
         rows.append((row["name"], row["passed"], f"{len(probed)}, {len(trained)}", *cells))
-    return table(("set", "passed", "runs", *GOING_WITH.values()), rows, (0, 1))
+    return table_lines(("set", "passed", "runs", *GOING_WITH.values()), rows, (0, 1))
 
 
 def _judged(runs: Sequence[Run]) -> Iterator[Row]:
@@ -233,4 +235,4 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
     methods.sort(key=lambda method: [returns.get((method, hidden), -1.0) for hidden in CORRUPTIONS], reverse=True)
     columns = [f"{words} hidden: return (episodes)|probe: pose, velocity" for words in CORRUPTIONS.values()]
     head = ["", *(name for both in columns for name in both.split("|"))]
-    return table(head, ((f"`{one}`", *(cell for h in CORRUPTIONS for cell in told(one, h))) for one in methods))
+    return table_lines(head, ((f"`{one}`", *(cell for h in CORRUPTIONS for cell in told(one, h))) for one in methods))

@@ -117,9 +117,9 @@ def sharing(seconds: float, rounds: int = 3) -> dict[str, float]:
     """Updates/s of a single run; ratio of the slower of two concurrent runs to it, and of it to one that waits
     actively.
 
-        Args:
-            seconds: training time per process.
-            rounds: alternating repetitions; medians count.
+    Args:
+        seconds: training time per process.
+        rounds: alternating repetitions; medians count.
     """
 
     def slowest(**how: Any) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 _ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "$": "&#36;", "`": "&#96;"}
@@ -33,6 +34,13 @@ def code_block(lines: list[str], language: str) -> list[str]:
     shown = list(map(one_line, lines))
     fence = _fence("\n".join(shown), 3)
     return [f"{fence}{language}", *shown, fence]
+
+
+def table_lines(head: Sequence[str], rows: Iterable[Iterable[object]], left: Collection[int] = (0,)) -> Iterator[str]:
+    """Lines of a Markdown table of escaped cells; `left` are the columns of text, the others are aligned right."""
+    yield f"| {' | '.join(head)} |".replace("|  |", "| |")
+    yield "|" + "".join("---|" if i in left else "---:|" for i in range(len(head)))
+    yield from (f"| {' | '.join(map(str, row))} |" for row in rows)
 
 
 def _fence(text: str, least: int) -> str:

@@ -36,8 +36,6 @@ MARK = "summary"
 """The table that every report has; its file identifies a report's folder."""
 WIDEST = 6
 """Maximum methods side by side in a matrix; further ones go below."""
-
-
 SEEDS = 12
 """Maximum seeds that are listed individually."""
 Tables = dict[str, pd.DataFrame]

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from vd4rl_pomdp.core.text import code, code_block, markdown, write_text
+from vd4rl_pomdp.core.text import code, code_block, markdown, table_lines, write_text
 from vd4rl_pomdp.envs.mazes import HARD, MAZES, PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_interval
 from vd4rl_pomdp.runs.files import write_csv
@@ -171,9 +171,8 @@ def table_sections(cells: pd.DataFrame) -> Iterator[str]:
         for view, table in mine.groupby("view", sort=False):
             mazes, rows = table["maze"].unique(), table["row"].unique()
             wide = table.pivot(index="row", columns="maze", values="text").loc[rows, mazes]
-            yield from (f"*{view}*", "", "| | " + " | ".join(mazes) + " |", "|---|" + "---|" * len(mazes))
-            yield from (f"| {label} | {' | '.join(row)} |" for label, row in zip(rows, wide.to_numpy(), strict=True))
-            yield ""
+            shown = ((label, *row) for label, row in zip(rows, wide.to_numpy(), strict=True))
+            yield from (f"*{view}*", "", *table_lines(["", *mazes], shown, range(len(mazes) + 1)), "")
 
 
 def write_tables(cells: pd.DataFrame, path: Path) -> None:
@@ -325,9 +324,9 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
         f"Of those for which the paper prints numbers, {sum(v.holds for v in printed)} of {len(printed)} hold.",
         "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds` says how many hold alone.",
         "",
-        "| maze | statement | here, % of std | holds | seeds | here, raw x 100 | holds | the paper's numbers |",
-        "|---|---|---|---|---|---|---|---|",
     ]
+    head = ["maze", "statement", "here, % of std", "holds", "seeds", "here, raw x 100", "holds", "the paper's numbers"]
+    rows = []
     waiting = ["no run yet", "-", "-"]
     for maze, percent, raw in pairs:
         claim = percent.claim
@@ -337,9 +336,10 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
         columns.append(
             f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}" if raw.paper else "none"
         )
-        lines.append(f"| {' | '.join(columns)} |")
+        rows.append(columns)
     return [
         *lines,
+        *table_lines(head, rows, range(len(head))),
         "",
         "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
         f"and need not keep the state. In the paper its position error is {recorder}.",
