@@ -41,9 +41,6 @@ def compare_results(one: Path, other: Path) -> SideBySide:
 
     Conditions are those of a report of each set. They are matched by equal settings, whatever their names; then by
     name; then, if a method has a single variant in each set, by method.
-
-    Raises:
-        UserError: a path holds no evaluated run, or a file is damaged.
     """
     (mine, first), (theirs, second) = _loaded(one), _loaded(other)
     runs = [run for side in (first, second) for seeds in side.values() for run in seeds]
@@ -59,9 +56,7 @@ def _loaded(path: Path) -> tuple[Row, Conditions]:
     runs = [run for run in load_runs([path]) if run.stage == "finetune"]
     finished = [run for run in runs if run.evaluated]
     if not finished:
-        raise UserError(
-            f"{path}: holds no finished and evaluated run to compare; name one that does; name one that does"
-        )
+        raise UserError(f"{path}: holds no finished and evaluated run to compare; name one that does")
     counts = {"finished": len(finished), "others": len(runs) - len(finished)}
     return {"path": path, **counts, "made": made_with(finished)}, groups(finished, lambda run: run.of(CONDITION))
 
