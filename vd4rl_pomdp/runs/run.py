@@ -155,6 +155,8 @@ class RunFolder:
             write_json(path, hardware)
         else:
             first, began = read_json(path), read_json(self.path / CONFIG_FILE)
+            if began["config"] != (config := began["config"] | self.config):  # of flags that may change
+                write_json(self.path / CONFIG_FILE, began | {"config": config})
             later = first.pop(CONTINUED, [])
             code = {name: began.get(name, {}) for name in now}  # versions, commit, and origin of plug-ins
             if (first | code | (later[-1] if later else {})) != hardware | now:
