@@ -86,7 +86,6 @@ class FinetuneConfig(StageConfig):
 
     @property
     def seed_of_views(self) -> int:
-        """Seed from which the views are drawn."""
         return self.seed if self.view_seed is None else self.view_seed
 
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
@@ -117,14 +116,12 @@ class FinetuneConfig(StageConfig):
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of the algorithm and of the encoder's memory."""
         return {
             "options": ALGORITHMS.named(values["algorithm"]).options.fill(values),
             "memory": HistoryOptions.fill(values),
         }
 
     def check(self) -> None:
-        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,

@@ -188,15 +188,12 @@ class FeatureSampler:
         """(2, views, M) int64: index of both ends of every transition in each view, with views concatenated."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume with the same batches."""
         return {"batches": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from `state_dict`."""
         self.draws.set_state(state["batches"])
 
     def sample(self) -> FeatureBatch:
-        """The next batch."""
         count = len(self.told)
         index = self.draws.integers(count, self.batch_size)
         view = self.draws.integers(len(self.features), self.batch_size)

@@ -46,7 +46,6 @@ class HistoryOptions(Options):
     }
 
     def check(self) -> None:
-        """Raise UserError for invalid values."""
         super().check()
         if self.shortest_history > self.longest_history:
             raise UserError(
@@ -93,7 +92,6 @@ class Histories:
         return content_hash([asdict(self._options), self._n_step, self._seed]) if self.random else ""
 
     def of_view(self, view: int) -> RandomHistories:
-        """Draw the random histories of a view."""
         generator = stream_generator(self._seed, "finetune", "histories", view)
         chosen = torch.randperm(len(self.rows), generator=generator)[: self.random].sort().values
         shortest, longest = self._options.shortest_history, self._options.longest_history

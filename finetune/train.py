@@ -150,7 +150,6 @@ class Updates:
     """Updates of one run or a stack, replayed as CUDA graphs on a GPU."""
 
     def __init__(self, trainers: Sequence[FinetuneTrainer]) -> None:
-        """Start from the trainers' current state."""
         first = trainers[0].algorithm
         self._algorithm: Algorithm | EndToEnd = first
         self._sampler: Any = trainers[0].sampler

@@ -201,7 +201,6 @@ class FinetuneTrainer:
             self.evaluate()
 
     def finish(self) -> None:
-        """Write the final files of a trained run."""
         path = self.folder.path
         if self.path_error:
             self.reference.with_path_error(self.path_error(self.algorithm.policy)).write(path)
@@ -265,13 +264,11 @@ class FinetuneTrainer:
         return rows
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to resume bit-identically."""
         self.settle()
         parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
         return {"step": self.step} | parts
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resume from `state`."""
         self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])

@@ -118,7 +118,6 @@ class StateWindowSampler(WindowSampler):
         self._longest = data.longest_episode if histories else 0
 
     def sample(self) -> StateWindows:
-        """Next batch."""
         window = self._histories() if self._longest else super().sample()
         return StateWindows(**window, state=self._states[self.view.dataset.rows(window.key)])
 
@@ -251,7 +250,6 @@ class Trainer:
             loop.require_finite(self.objective)  # no later loss would show that the last step diverged
 
     def state(self) -> dict[str, Any]:
-        """Everything needed for a bit-exact resume."""
         return {
             "step": self.step,
             "objective": self.objective.state_dict(),
@@ -260,7 +258,6 @@ class Trainer:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`."""
         self.step = state["step"]
         self.objective.load_state_dict(state["objective"])
         self.optimiser.load_state_dict(state["optimiser"])

@@ -136,12 +136,10 @@ class Algorithm(ABC):
         return {name: part for name, part in vars(self).items() if isinstance(part, nn.Module | Optimizer)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume: the state of all parts, the number of updates, the noise."""
         parts = {name: part.state_dict() for name, part in self.parts().items()}
         return parts | {"updates": int(self.updates), "noise": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from `state_dict`."""
         for name, part in self.parts().items():
             part.load_state_dict(state[name])
         if isinstance(self.updates, Tensor):

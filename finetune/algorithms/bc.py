@@ -47,14 +47,12 @@ class BC(Algorithm):
         self.optimiser = Adam(policy.net.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """One step on the one loss."""
         noise = self.draws.normal(*batch.action.shape) * noise_at(self.updates, self.planned)
         logs = self.minimise(self.cloning_loss, batch, noise, along=(self.optimiser, *encoder))
         self.updates += 1
         return logs
 
     def cloning_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Mean of (a~ - a)^2."""
         chosen = with_noise(self.policy(batch.z), noise)
         loss = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"bc_loss": loss.detach()})

@@ -70,7 +70,6 @@ class Flow(nn.Module):
         self.rest = nn.Sequential(_gelu(), *deeper, ExactLinear(hidden, action_dim))
 
     def forward(self, z: Tensor, x: Tensor, t: Tensor) -> Tensor:
-        """Velocity of x at time t."""
         return self._velocity(self.state(z), x, t)
 
     def act(self, z: Tensor, noise: Tensor) -> Tensor:
@@ -119,7 +118,6 @@ class FQL(Algorithm):
         self.optimiser = Adam([p for module in learnt for p in module.parameters()], learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """One step of all networks on the summed loss, then one of the critics' targets."""
         shape = batch.action.shape
         next_noise, start, noise = (self.draws.normal(*shape) for _ in range(3))
         time = self.draws.uniform(*shape[:-1], 1)
@@ -146,7 +144,6 @@ class FQL(Algorithm):
         return Loss(critic.value + flow.value + policy.value, critic.logs | flow.logs | policy.logs)
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Mean squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value = _mean(self.target_critic(next_z, self.noise_in.act(self.policy, next_z, noise)))

@@ -87,7 +87,6 @@ class ReBRAC(TD3BC):
         return value - self.settings.critic_bc * away, {"next_bc_loss": away.mean()}
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
-        """Weighted cloning minus the value, normalised by mean |Q|."""
         z = self.policy.standardise(batch.z.detach())
         chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)

@@ -50,7 +50,6 @@ class TwinCritic(nn.Module):
         self.second = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
 
     def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Both values."""
         both = torch.cat([z, action], dim=-1)
         return self.first(both)[:, 0], self.second(both)[:, 0]
 
@@ -97,11 +96,9 @@ class TD3BC(Algorithm):
         return (self.draws.normal(*batch.action.shape) * TARGET_NOISE).clamp(-NOISE_CLIP, NOISE_CLIP)
 
     def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:
-        """Noise for the actor's own actions: none."""
         return ()
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value, logs = self._next_value(batch, next_z, self._next_action(next_z, noise))
@@ -111,7 +108,6 @@ class TD3BC(Algorithm):
         return Loss(loss.value, loss.logs | logs)
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
-        """Cloning minus the value, normalised by mean |Q|."""
         z = self.policy.standardise(batch.z.detach())  # an encoder is trained by the critics' loss only
         chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)
@@ -127,18 +123,14 @@ class TD3BC(Algorithm):
         return torch.minimum(*self.target_critic(next_z, chosen)), {}
 
     def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:
-        """Action of the target policy, smoothed by noise."""
         return (self.target_policy.from_standardised(next_z) + noise).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
-        """Value that the actor maximises."""
         return self.critic.first(torch.cat([z, action], dim=-1))
 
     def _policy_action(self, z: Tensor, *noise: Tensor) -> Tensor:
-        """Action in the actor's loss."""
         return self.policy.from_standardised(z)
 
     def move_targets(self) -> None:
-        """Move the target networks by the fraction tau."""
         move_target(self.target_critic, self.critic, self.tau)
         move_target(self.target_policy.net, self.policy.net, self.tau)

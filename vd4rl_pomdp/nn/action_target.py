@@ -39,7 +39,6 @@ class KMeansTarget(nn.Module):
         self.centers: Tensor
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
-        """See `ActionTarget`."""
         code = torch.cdist(action.reshape(-1, action.shape[-1]), self.centers).argmin(-1)
         loss = F.cross_entropy(logits.reshape(-1, self.outputs).float(), code, reduction="none")
         return loss.view(action.shape[:-1])
@@ -54,7 +53,6 @@ class BinsTarget(nn.Module):
         self.outputs = action_dim * bins
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
-        """See `ActionTarget`."""
         code = ((action.clamp(-1, 1) + 1) / 2 * self.bins).long().clamp_(max=self.bins - 1)
         loss = F.cross_entropy(logits.reshape(-1, self.bins).float(), code.reshape(-1), reduction="none")
         return loss.view(action.shape).mean(-1)
@@ -69,7 +67,6 @@ class MSETarget(nn.Module):
         self.normalise = normalise
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
-        """See `ActionTarget`."""
         if self.normalise:
             logits, action = F.normalize(logits.float(), dim=-1), F.normalize(action, dim=-1)
         return (logits.float() - action).square().mean(-1)

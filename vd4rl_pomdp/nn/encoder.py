@@ -49,7 +49,6 @@ class EncoderConfig:
 
     @property
     def dim(self) -> int:
-        """Dimension of the representation."""
         widths = {"frame": self.feature_dim, "state": self.hidden_dim}
         return widths["frame"] if self.history == "none" else sum(widths[part] for part in self.readout.split("+"))
 
@@ -144,7 +143,6 @@ class Encoder(nn.Module):
 
     @property
     def _row_width(self) -> int:
-        """Input width of the memory."""
         return self.config.feature_dim + (self.config.action_dim if self.config.use_actions else 0)
 
     def make_memory(self, inputs: int) -> Memory:
@@ -154,7 +152,6 @@ class Encoder(nn.Module):
 
     @property
     def dim(self) -> int:
-        """Dimension of the representation."""
         return self.config.dim
 
     @property
@@ -198,7 +195,6 @@ class Encoder(nn.Module):
         return self._read(features, torch.cat([first, later.view(*recent.shape[:2], -1)], dim=1))
 
     def initial_state(self, batch: int) -> StreamState:
-        """State at the start of an episode."""
         weight = next(self.parameters())
         hidden, rows = weight.new_zeros(0), weight.new_zeros(0)
         if self.memory is not None:

@@ -71,7 +71,6 @@ class FrameEncoder(nn.Module):
         self.project = nn.Sequential(nn.Linear(flat, feature_dim), nn.LayerNorm(feature_dim), nn.Tanh())
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Features of every stack."""
         return _features(self, obs, self._precision(obs))
 
     def maps(self, obs: Tensor) -> Tensor:
@@ -84,7 +83,6 @@ class FrameEncoder(nn.Module):
         return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
 
     def _precision(self, obs: Tensor) -> torch.dtype:
-        """Dtype that pixels are converted to."""
         if torch.is_autocast_enabled(obs.device.type):
             return torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor in memory
         return next(self.project.parameters()).dtype
@@ -146,7 +144,6 @@ class MixerLayer(nn.Module):
         self.over_features = nn.Sequential(nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
         x = x + self.over_patches(self.norms[0](x).transpose(1, 2)).transpose(1, 2)
         return x + self.over_features(self.norms[1](x))
 

@@ -52,7 +52,6 @@ class ExactLinear(nn.Linear):
     """A linear layer with autocast disabled, for outputs whose small differences matter."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., inputs) -> (..., outputs)."""
         with torch.autocast(x.device.type, enabled=False):
             return super().forward(x.to(self.weight))
 

@@ -44,7 +44,6 @@ class Standardise(nn.Module):
         self.std.copy_((squares / len(flat) - mean.square()).clamp(min=0).sqrt() + 1e-3)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Standardised copy of (..., dim)."""
         return (z.float() - self.mean) / self.std
 
 
@@ -58,11 +57,9 @@ class Policy(nn.Module):
         self.net = mlp(dim, hidden, action_dim, last=ExactLinear)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Mean action."""
         return self.from_standardised(self.standardise(z))
 
     def from_standardised(self, z: Tensor) -> Tensor:
-        """Mean action for representations that are already standardised."""
         return torch.tanh(self.net(z))
 
     def save(self, folder: Path | str, step: int | None = None) -> None:

@@ -56,7 +56,6 @@ class Pretrained(nn.Module):
             self.register_buffer(key, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Features of every stack; see the class."""
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
         frames = (frames + 0.5 - self.mean) / self.std
         features = []

@@ -84,7 +84,6 @@ class Integrator(GRU):
         return next(self.parameters()).new_zeros(self.num_layers, batch, self.hidden_size + 1 + self.features)
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        """See `Memory`."""
         hidden, count, first = state.split([self.hidden_size, 1, self.features], dim=2)
         t = count[0] + torch.arange(rows.shape[1], device=rows.device)  # (B, T)
         first = torch.where(count[0] > 0, first[0], rows[:, 0, : self.features])

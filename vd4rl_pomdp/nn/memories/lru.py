@@ -46,7 +46,6 @@ class LRUOptions(MemoryOptions):
     }
 
     def check(self) -> None:
-        """Raise UserError for invalid values."""
         super().check()
         if self.r_min >= self.r_max:
             raise UserError(f"--r-min is {self.r_min}, --r-max {self.r_max}: choose a greater --r-max")
@@ -73,7 +72,6 @@ class LRU(Memory):
         return self.nu.new_zeros(len(self.nu), batch, 2 * self.nu.shape[1])
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Memory`."""
         decays = torch.polar((-self.nu.exp()).exp(), self.theta.exp())
         scales = self.gamma.exp()[..., None]
         x, kept = self.read(rows), []

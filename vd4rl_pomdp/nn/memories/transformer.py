@@ -60,7 +60,6 @@ class Transformer(Memory):
         return self.bias.new_zeros(1, batch, sum(self._sizes))
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Memory`."""
         batch, count, _ = rows.shape
         there, *pasts = state[0].split(self._sizes, dim=1)
         there = torch.cat([there, there.new_ones(batch, count)], dim=1)
