@@ -30,7 +30,7 @@ from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
-from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, save_encoder, tell_probe
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, save_encoder, record_probe
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import Actor, read_actor
@@ -157,11 +157,11 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.num_episodes < 2 or dataset.task is None or dataset.task not in TASKS:
         return
     if (run.path / PROBE_FILE).exists():
-        tell_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
+        record_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
     errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))
-    tell_probe(run.path / "encoder", errors)
+    record_probe(run.path / "encoder", errors)
     write_json(run.path / PROBE_FILE, errors)
 
 
