@@ -30,7 +30,7 @@ from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
-from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, save_encoder, record_probe
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, record_probe, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import Actor, read_actor

@@ -196,7 +196,10 @@ class Twice(nn.Module):
     ("build", "told"),
     [
         (lambda channels, size, options: None, "frame encoder 'mine' builds a NoneType, not a module: return what"),
-        (lambda channels, size, options: Twice(), r"module must give feature maps \(N, C', H', W'\), not a tuple"),
+        (
+            lambda channels, size, options: Twice(),
+            r"frame encoder 'mine' makes a tuple of N images, not maps \(N, C', H', W'\)",
+        ),
     ],
 )
 def test_what_builds_no_module_of_maps_is_refused(encoders, build, told):

@@ -9,7 +9,14 @@ import yaml
 from huggingface_hub import ModelCard
 
 from tests.nn.test_encoder import CARD, make
-from vd4rl_pomdp.nn.encoder_folder import copy_encoder, encoder_hash, model_card, read_record, save_encoder, record_probe
+from vd4rl_pomdp.nn.encoder_folder import (
+    copy_encoder,
+    encoder_hash,
+    model_card,
+    read_record,
+    record_probe,
+    save_encoder,
+)
 
 
 def cells(text: str) -> dict[str, str]:

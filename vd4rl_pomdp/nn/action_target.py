@@ -92,14 +92,7 @@ def target_options(name: str) -> type[Options]:
 
 
 def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) -> KMeansTarget | BinsTarget | MSETarget:
-    """Build an action target.
-
-    Args:
-        name: kmeans, bins, mse or mse_l2.
-        actions: (N, A) float32 training actions; K-means is fitted to them.
-        codes: number of K-means centres, or of bins per dimension; ignored by mse and mse_l2.
-        seed: the run's seed, for K-means.
-    """
+    """Build an action target; K-means is fitted to `actions`, the (N, A) float32 training actions."""
     if name == "kmeans":
         return KMeansTarget(actions, codes, seed)
     if name == "bins":

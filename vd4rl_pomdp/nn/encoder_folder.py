@@ -81,7 +81,9 @@ def load_encoder(
     config, card = record.encoder, record.pretrain
     other = ""
     if action_dim not in (None, config.action_dim):
-        other = f"was pretrained on {card.task} with {config.action_dim} action dimensions, the dataset has {action_dim}"
+        other = (
+            f"was pretrained on {card.task} with {config.action_dim} action dimensions, the dataset has {action_dim}"
+        )
     elif size not in (None, config.size) and config.frame_encoder != STATE:
         other = f"reads images of {config.size}x{config.size} pixels, the dataset has {size}x{size}"
     elif task not in (None, card.task):

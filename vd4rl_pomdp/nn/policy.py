@@ -87,5 +87,5 @@ def load_policy(folder: Path | str) -> Policy:
 def policy_step(folder: Path) -> int | None:
     """Training step stored with a policy folder's weights, None if there is none; UserError as `load_policy`."""
     with damaged(folder, *_NO_POLICY):
-        told = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
-        return None if told is None else int(told)
+        step = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
+        return None if step is None else int(step)

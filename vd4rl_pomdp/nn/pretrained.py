@@ -29,17 +29,7 @@ class Pretrained(nn.Module):
     std: Tensor
 
     def __init__(self, name: str, size: int, weights: str, channels: int) -> None:
-        """Load the model.
-
-        Args:
-            name: a model in transformers' cache, or a folder written by `save_pretrained`.
-            size: height and width to which frames are resized, bilinearly.
-            weights: required content hash of the model's weights; empty: any.
-            channels: channels of a stack, 3 per frame.
-
-        Raises:
-            UserError: transformers or the model is missing, the weights differ, or channels is not a multiple of 3.
-        """
+        """Load the model; see `PretrainedOptions`, and UserError if transformers or the model is missing."""
         super().__init__()
         if channels % 3:
             raise UserError(f"--frame-encoder pretrained needs frames of 3 channels, not {channels}")
@@ -60,9 +50,9 @@ class Pretrained(nn.Module):
         frames = (frames + 0.5 - self.mean) / self.std
         features = []
         for part in frames.split(AT_ONCE):
-            told = self._model[0](part)
-            pooled = getattr(told, "pooler_output", None)
-            features.append((told.last_hidden_state[:, 0] if pooled is None else pooled).flatten(1))
+            output = self._model[0](part)
+            pooled = getattr(output, "pooler_output", None)
+            features.append((output.last_hidden_state[:, 0] if pooled is None else pooled).flatten(1))
         return torch.cat(features).reshape(len(image), -1, 1, 1)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

@@ -68,14 +68,7 @@ def _errors(features: np.ndarray, targets: np.ndarray, test: np.ndarray) -> np.n
 
 
 def probe_state(features: np.ndarray, physics: np.ndarray, episode: np.ndarray, layout: Layout) -> dict[str, float]:
-    """`probe_error` for pose (without global position) and for velocity.
-
-    Args:
-        features: (N, D) representations.
-        physics: (N, P) simulator states.
-        episode: (N,) episode of every row.
-        layout: splits states into pose and velocity.
-    """
+    """`probe_error` for pose (without global position) and for velocity, from (N, P) simulator states."""
     return {
         "probe_pose": probe_error(features, layout.pose(physics), episode),
         "probe_velocity": probe_error(features, layout.velocity(physics), episode),
