@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
-from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+from vd4rl_pomdp.testing.contract import Check, claim, claim_close, claim_equal, run_checks, shown
 
 DIM, ACTIONS, SIZE = 3, 2, 32
 UPDATES = 4
@@ -26,16 +26,7 @@ UPDATES = 4
 
 
 def check_algorithm(name: str, **options: Any) -> None:
-    """Run all checks on a fine-tuning algorithm.
-
-    Args:
-        name: name in `finetune.algorithms.ALGORITHMS`.
-        options: its options.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such algorithm or option.
-    """
+    """Run all checks on a fine-tuning algorithm of `finetune.algorithms.ALGORITHMS`."""
     run_checks("algorithm", CHECKS, name, **options)
 
 
@@ -78,8 +69,8 @@ def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict
     step = algorithm.step
 
     def watching(loss: Loss, *optimisers: Optimizer) -> None:
-        asked = [*_optimised(optimisers[0]), z]
-        reached = torch.autograd.grad(loss.value, asked, retain_graph=True, allow_unused=True)
+        inputs = [*_optimised(optimisers[0]), z]
+        reached = torch.autograd.grad(loss.value, inputs, retain_graph=True, allow_unused=True)
         before = _networks(algorithm)
         step(loss, *optimisers)
         steps.append(Step(loss, optimisers[0], list(reached), before, _networks(algorithm)))
@@ -206,9 +197,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
             torch.manual_seed(seed)
             logs.append({key: value.item() for key, value in algorithm.update(batch(number)).items()})
         claim(logs[0] == logs[1], f"update {number} logs {logs[0]} and {logs[1]}: keep all in parts, draw from draws")
-    here, there = tensors_of(one.state_dict()), tensors_of(other.state_dict())
-    differing = [key for key in here if not torch.equal(here[key], there[key])]
-    claim(differing == [], f"these differ at the end: {shown(differing)}")
+    claim_equal(tensors_of(one.state_dict()), tensors_of(other.state_dict()), "these differ at the end")
 
 
 def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
@@ -230,11 +219,8 @@ def farther_than_rounding(
 ) -> list[str]:
     """Tensors that differ from a single run's by more than rounding explains, and by how much.
 
-    Args:
-        found: tensors by name.
-        single: repeats a single run and returns its tensors; its argument modifies the algorithm before the first
-            step.
-        times: tolerance, in multiples of the largest change by three other summation orders or float32's epsilon.
+    `single` repeats a single run; its argument modifies the algorithm before the first step. The tolerance is `times`
+    the largest change by three other summation orders or float32's epsilon.
     """
     expected = single(lambda algorithm: algorithm)
     others = [single(lambda algorithm, seed=seed: permuted(algorithm, seed)) for seed in range(3)]  # type: ignore[misc]
@@ -297,8 +283,7 @@ def a_batch_is_left_as_it_was(name: str, **options: Any) -> None:
     """An update does not modify its batch."""
     given = batch()
     make(name, **options).update(given)
-    changed = [f.name for f in fields(FeatureBatch) if not torch.equal(given[f.name], batch()[f.name])]
-    claim(changed == [], f"it changed {shown(changed)}")
+    claim_equal(dict(**given), dict(**batch()), "it changed")
 
 
 CHECKS: tuple[Check, ...] = (

@@ -33,16 +33,7 @@ _MODES: tuple[Mode, ...] = get_args(Mode)
 
 
 def check_corruption(name: str, **options: Any) -> None:
-    """Run all checks on a corruption.
-
-    Args:
-        name: name of a stage in `vd4rl_pomdp.corruptions.STAGES`, or several joined by `+`.
-        options: the stages' options.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such stage or option, or an option has the name of a pretraining setting.
-    """
+    """Run all checks on a corruption: a stage of `vd4rl_pomdp.corruptions.STAGES`, or several joined by `+`."""
     CorruptionConfig.of(name, **options)
     PretrainConfig.of("smoke", corruption=name, **options)
     run_checks("corruption", CHECKS, name, **options)

@@ -18,14 +18,9 @@ DECISIONS = 12
 
 
 def check_task(name: str) -> None:
-    """Run all checks on a task by playing a few short episodes.
+    """Run all checks on a task of `vd4rl_pomdp.core.tasks.TASKS` by playing a few short episodes.
 
-    Args:
-        name: name in `vd4rl_pomdp.core.tasks.TASKS`.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such task, or its environment cannot be built or returns no images or numeric rewards.
+    UserError also if its environment cannot be built or returns no images or numeric rewards.
     """
     TASKS.named(name)
     run_checks("task", CHECKS, name)
