@@ -135,15 +135,13 @@ def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, decision
 
     Args:
         config: the settings as given.
-        algorithm: algorithm that the encoder's method dictates (end-to-end methods such as bc); empty if the encoder is
-            frozen.
+        algorithm: of an end-to-end method, such as bc; empty if the encoder is frozen.
         remembers: whether the encoder has memory.
-        decisions: decisions in one episode of the task; the default `eval_length` is raised to it.
+        decisions: in one episode of the task; the default `eval_length` is raised to it.
     """
     if config.eval_length == FinetuneConfig.eval_length:
         config = replace(config, eval_length=max(config.eval_length, decisions))
     if algorithm:
-        told = config.defaults(config.preset) | flat(config)
-        options = ALGORITHMS.named(algorithm).options.fill(told)
+        options = ALGORITHMS.named(algorithm).options.fill(config.defaults(config.preset) | flat(config))
         config = replace(config, algorithm=algorithm, options=options, views=0)
     return config if remembers and not algorithm else replace(config, memory=NO_OPTIONS)

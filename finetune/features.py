@@ -133,7 +133,7 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
         frozen: the encoder and its dataset.
         histories: which features there are.
         views: number of draws of corruption and shift.
-        kept: file that keeps the features for resuming; the run itself checks that dataset and encoder are unchanged.
+        kept: file of the features for resuming; the run itself checks that dataset and encoder are unchanged.
         encoder: hash of the encoder's weights (`encoder_hash`).
 
     Returns:
@@ -179,7 +179,7 @@ class FeatureSampler:
         dataset, rows = histories.dataset, histories.rows
         reward, discount, _ = dataset.n_step_returns(rows, n_step, gamma)
         actions = dataset.action_after(rows), dataset.action_or_zero(histories.ends)
-        self.told = torch.cat([*actions, reward[:, None], discount[:, None]], dim=1)
+        self.data = torch.cat([*actions, reward[:, None], discount[:, None]], dim=1)
         """(M, 2 A + 2): actions at both ends, reward and discount of every transition, in one tensor to save GPU kernel
         launches."""
         # the critics' targets can use cached z' because the encoder never changes
@@ -194,11 +194,11 @@ class FeatureSampler:
         self.draws.set_state(state["batches"])
 
     def sample(self) -> FeatureBatch:
-        count = len(self.told)
+        count = len(self.data)
         index = self.draws.integers(count, self.batch_size)
         view = self.draws.integers(len(self.features), self.batch_size)
         ends = self.ends.flatten(1)[:, torch.add(index, view, alpha=count)]
-        return _batch(_rows(self.features.flatten(0, 1), ends), _rows(self.told, index))
+        return _batch(_rows(self.features.flatten(0, 1), ends), _rows(self.data, index))
 
 
 class StackedSampler:
@@ -208,25 +208,25 @@ class StackedSampler:
         """Start from copies of the runs' samplers, which must agree in views and batch size."""
         self._features = [sampler.features.flatten(0, 1) for sampler in samplers]
         self._shared = all(sampler.features is samplers[0].features for sampler in samplers)
-        self._counts, self._views = [len(sampler.told) for sampler in samplers], len(samplers[0].features)
+        self._counts, self._views = [len(sampler.data) for sampler in samplers], len(samplers[0].features)
         self._shape = len(samplers), samplers[0].batch_size
         self.draws = stacked([sampler.draws for sampler in samplers])
-        self._told = torch.cat([sampler.told for sampler in samplers])
+        self._data = torch.cat([sampler.data for sampler in samplers])
         self._ends = torch.cat([sampler.ends for sampler in samplers], dim=2).flatten(1)
         first = [sum(self._counts[:number]) for number in range(len(samplers))]
-        self._first = torch.tensor(first, device=self._told.device)[:, None]
+        self._first = torch.tensor(first, device=self._data.device)[:, None]
 
     def sample(self) -> FeatureBatch:
         """The next batch of every run: tensors of (S, B, ...)."""
         index = self.draws.integers(self._counts, *self._shape) + self._first
         view = self.draws.integers(self._views, *self._shape)
-        ends = self._ends[:, torch.add(index, view, alpha=len(self._told))]
+        ends = self._ends[:, torch.add(index, view, alpha=len(self._data))]
         if self._shared:
             both = _rows(self._features[0], ends)
         else:
             pairs = zip(self._features, ends.unbind(1), strict=True)
             both = torch.stack([_rows(own, end) for own, end in pairs], dim=1)
-        return _batch(both, _rows(self._told, index))
+        return _batch(both, _rows(self._data, index))
 
 
 def _rows(values: Tensor, numbers: Tensor) -> Tensor:
@@ -234,11 +234,11 @@ def _rows(values: Tensor, numbers: Tensor) -> Tensor:
     return values.index_select(0, numbers.flatten()).view(*numbers.shape, -1)
 
 
-def _batch(both: Tensor, told: Tensor) -> FeatureBatch:
+def _batch(both: Tensor, data: Tensor) -> FeatureBatch:
     """Build a batch from (2, ..., D) features of both ends and (..., 2 A + 2) actions, rewards and discounts."""
     z, next_z = both.float()
-    action, next_action = told[..., :-2].chunk(2, dim=-1)
-    return FeatureBatch(z, action, told[..., -2], told[..., -1], next_z, next_action)
+    action, next_action = data[..., :-2].chunk(2, dim=-1)
+    return FeatureBatch(z, action, data[..., -2], data[..., -1], next_z, next_action)
 
 
 class ExactSampler(Sampler):

@@ -44,26 +44,25 @@ def finetune_all(
 ) -> list[RunFolder]:
     """Run or resume the stage for several runs, with shared updates (see `finetune.stack`).
 
-    Args:
-        configs: one per run; may differ in seeds, encoder, data and evaluation settings.
-        words: command-line words of each run, for its record.
+    They may differ in seeds, encoder, data and evaluation; `words` are each run's command line, for its record.
 
     Raises:
         UserError: invalid settings, or runs that cannot be stacked.
         FloatingPointError: a run diverged; the others were trained to the end.
     """
     datasets: dict[Path, Dataset] = {}
-    asked = [_Asked(config, datasets, own) for config, own in zip(configs, words or [None] * len(configs), strict=True)]
-    if len(asked) > 1:
-        _refuse_unlike(asked)
+    commands = words or [None] * len(configs)
+    prepared = [_Prepared(config, datasets, own) for config, own in zip(configs, commands, strict=True)]
+    if len(prepared) > 1:
+        _refuse_unlike(prepared)
     with ExitStack() as owned:
-        for one in asked:
+        for one in prepared:
             owned.enter_context(one.run)
-        train([one.trainer() for one in asked if not one.run.finished])
-    return [one.run for one in asked]
+        train([one.trainer() for one in prepared if not one.run.finished])
+    return [one.run for one in prepared]
 
 
-class _Asked:
+class _Prepared:
     """A requested run and its inputs."""
 
     def __init__(self, config: FinetuneConfig, datasets: dict[Path, Dataset], words: Sequence[str] | None) -> None:
@@ -76,7 +75,11 @@ class _Asked:
         self.encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
         refuse_outside(config, shift=(0, dataset.frame_size - 1))
         remembers = self.encoder.memory is not None
-        self.config = config = as_trained(config, card.end_to_end, remembers, _decisions(config, card.task))
+        try:
+            decisions = TASKS.named(card.task).decisions if config.eval_episodes else 0
+        except UserError as error:
+            raise UserError(f"{error}; `--eval-episodes 0` trains a policy without playing it") from error
+        self.config = config = as_trained(config, card.end_to_end, remembers, decisions)
         if isinstance(config.memory, HistoryOptions):
             self.encoder.config = replace(self.encoder.config, **config.memory.encoder_changes)
         if self.encoder.reads_state:
@@ -97,14 +100,6 @@ class _Asked:
         return make_trainer(self.config, self.dataset, self.encoder.to(self.device), self.card, self.run)
 
 
-def _decisions(config: FinetuneConfig, task: str) -> int:
-    """Decisions in an evaluation episode; UserError for an unknown task if there are any."""
-    try:
-        return TASKS.named(task).decisions if config.eval_episodes else 0
-    except UserError as error:
-        raise UserError(f"{error}; `--eval-episodes 0` trains a policy without playing it") from error
-
-
 ALIKE = (
     *("algorithm", "updates", "batch_size", "hidden_dim", "learning_rate", "update_precision", "views", "device"),
     *("eval_every", "log_every", "checkpoint_every"),
@@ -112,10 +107,10 @@ ALIKE = (
 """Settings that all runs of a stack must share, besides the algorithm's options."""
 
 
-def _refuse_unlike(asked: Sequence[_Asked]) -> None:
+def _refuse_unlike(prepared: Sequence[_Prepared]) -> None:
     """Raise UserError for runs that cannot be stacked, naming two of them and the difference."""
-    first = asked[0]
-    for number, one in enumerate(asked):
+    first = prepared[0]
+    for number, one in enumerate(prepared):
         if one.card.end_to_end:
             raise UserError(
                 f"{one.config.out}: {one.card.method} also trains its encoder and cannot be stacked; train it by itself"
@@ -124,7 +119,7 @@ def _refuse_unlike(asked: Sequence[_Asked]) -> None:
             raise UserError(
                 f"{one.config.out}: --views 0 encodes every batch and cannot be stacked; train it by itself"
             )
-        if any(one.config.out.resolve() == other.config.out.resolve() for other in asked[:number]):
+        if any(one.config.out.resolve() == other.config.out.resolve() for other in prepared[:number]):
             raise UserError(f"--out {one.config.out} is given twice: a folder holds one run")
         for (what, value), (_, other) in zip(_alike(first), _alike(one), strict=False):
             if value != other:
@@ -134,10 +129,10 @@ def _refuse_unlike(asked: Sequence[_Asked]) -> None:
                 )
 
 
-def _alike(asked: _Asked) -> list[tuple[str, Any]]:
+def _alike(prepared: _Prepared) -> list[tuple[str, Any]]:
     """What runs of a stack must share, as (description, value). The algorithm comes first: it decides the options."""
-    settings = {name: getattr(asked.config, name) for name in ALIKE} | flat(asked.config.options)
-    widths = [("the representations' width", asked.encoder.dim), ("the actions' width", asked.dataset.action_dim)]
+    settings = {name: getattr(prepared.config, name) for name in ALIKE} | flat(prepared.config.options)
+    widths = [("the representations' width", prepared.encoder.dim), ("the actions' width", prepared.dataset.action_dim)]
     return [(flag_of(name), value) for name, value in settings.items()] + widths
 
 

@@ -73,12 +73,7 @@ def make_trainer(
 ) -> FinetuneTrainer:
     """Build a run's trainer, with batches from cached features, from features encoded on the fly, or from pixels.
 
-    Args:
-        config: settings of the run.
-        dataset: its dataset, on the device.
-        encoder: on the device too.
-        card: the encoder's metadata, with the dataset's quality.
-        run: its folder, which must be owned; labels, encoder and features are written there.
+    Labels, encoder and features are written into the run's folder, which must be owned.
     """
     write_json(run.path / LABELS_FILE, labels_of(config, card))
     if not all((run.path / name).exists() for name in FILES_OF_RUN):
@@ -125,16 +120,9 @@ def path_error(
     encode: Callable[[int], torch.Tensor],
     policy: Callable[[torch.Tensor], torch.Tensor],
 ) -> float:
-    """Difference between a policy and the data's behaviour policy, on the data's own states.
+    """Mean squared difference between a policy and the behaviour policy's mean action, on the data's own states.
 
-    Args:
-        dataset: a dataset with simulator states.
-        actor: the behaviour policy.
-        encode: episode number -> representations (rows, D).
-        policy: (rows, D) -> actions (rows, A).
-
-    Returns:
-        Mean squared difference to the actor's mean action over all decisions of at most PATH_EPISODES episodes.
+    Over all decisions of at most PATH_EPISODES episodes. `encode` gives an episode's representations (rows, D).
     """
     assert dataset.task is not None
     assert dataset.physics is not None

@@ -133,8 +133,8 @@ class PretrainConfig(TrainingConfig):
         method = METHODS.named(self.method)
         refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
         if self.batch_size < method.least_batch:
-            told = f"{self.method} tells windows apart: give it {method.least_batch}"
-            raise UserError(f"--batch-size is {self.batch_size}; {told}")
+            why = f"{self.method} tells windows apart: give it {method.least_batch}"
+            raise UserError(f"--batch-size is {self.batch_size}; {why}")
         if self.frame_encoder == STATE and not (isinstance(self.options, ActionOptions) or self.method == "random"):
             raise UserError(f"--frame-encoder state is for random and methods that predict actions, not {self.method}")
 

@@ -59,12 +59,10 @@ class BC(Algorithm):
 
 
 def noise_at(update: int | Tensor, planned: int) -> float | Tensor:
-    """Standard deviation of the noise after some updates: decays linearly, then stays constant.
+    """Standard deviation of the noise after some of the planned updates: decays linearly, then stays constant.
 
-    Args:
-        update: updates done, see `Algorithm.updates`.
-        planned: total updates. The noise decays over half of them if that is sooner than in V-D4RL, which trains for
-            550,000: noise that is still large at the end of training leaves the policy's actions pushed outwards.
+    It decays over half of them if that is sooner than in V-D4RL, which trains for 550,000: noise that is still large at
+    the end of training leaves the policy's actions pushed outwards.
     """
     done = share_of(update, min(NOISE_UPDATES, planned / 2))
     return NOISE_START + done * (NOISE_END - NOISE_START)

@@ -129,18 +129,10 @@ class FQL(Algorithm):
     def loss(self, batch: FeatureBatch, next_noise: Tensor, start: Tensor, time: Tensor, noise: Tensor) -> Loss:
         """Sum of three losses, each of which treats the other two's networks as constants.
 
-        Args:
-            batch: transitions.
-            next_noise: (B, A), of the next actions.
-            start: (B, A), start points of the cloned flow.
-            time: (B, 1), times along the flow.
-            noise: (B, A), of the policy's actions.
+        The flow is cloned from `start` (B, A), at times (B, 1); the other noise (B, A) is that of the actions.
         """
-        critic, flow, policy = (
-            self.critic_loss(batch, next_noise),
-            self.flow_loss(batch, start, time),
-            self.policy_loss(batch, noise),
-        )
+        critic, policy = self.critic_loss(batch, next_noise), self.policy_loss(batch, noise)
+        flow = self.flow_loss(batch, start, time)
         return Loss(critic.value + flow.value + policy.value, critic.logs | flow.logs | policy.logs)
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:

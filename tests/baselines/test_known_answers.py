@@ -6,7 +6,11 @@ import math
 import pytest
 import torch
 
-from baselines import ACDF, CURL, DRIML, HOMER, SMWM, ACDFOptions, DRIMLOptions, HOMEROptions, SMWMOptions
+from baselines.acdf import ACDF, ACDFOptions
+from baselines.curl import CURL
+from baselines.driml import DRIML, DRIMLOptions
+from baselines.homer import HOMER, HOMEROptions
+from baselines.smwm import SMWM, SMWMOptions
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import MSETarget
