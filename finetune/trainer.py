@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -133,9 +133,9 @@ def path_error(
     errors = []
     for number in deciding[np.unique(np.linspace(0, last, min(last + 1, PATH_EPISODES)).astype(int))].tolist():
         physics = dataset.physics[dataset.rows_of(number)][:-1]  # no decision at an episode's last row
-        shown = np.array([actor.act(state) for state in observed_states(task, physics)])
+        behaviour = np.array([actor.act(state) for state in observed_states(task, physics)])
         actions = policy(encode(number)[:-1]).cpu().numpy()
-        errors.append(np.square(actions - shown.reshape(actions.shape)).mean(1))
+        errors.append(np.square(actions - behaviour.reshape(actions.shape)).mean(1))
     return float(np.concatenate(errors).mean())
 
 
@@ -153,28 +153,22 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     write_json(run.path / PROBE_FILE, errors)
 
 
+@dataclass(eq=False)
 class FinetuneTrainer:
     """One run: an algorithm, its batches, and where the results go."""
 
-    loop: Loop
+    algorithm: Algorithm | EndToEnd
+    sampler: FeatureSampler | ExactSampler | TransitionSampler
+    config: FinetuneConfig
+    card: EncoderCard
+    folder: RunFolder
+    reference: Reference
+    path_error: Callable[[Policy], float] | None
+    step: int = 0
+    settle: Callable[[], None] = lambda: None
+    """Brings algorithm and sampler up to date when a stack makes the updates."""
+    loop: Loop = field(init=False)
     """Set while training."""
-
-    def __init__(
-        self,
-        algorithm: Algorithm | EndToEnd,
-        sampler: FeatureSampler | ExactSampler | TransitionSampler,
-        config: FinetuneConfig,
-        card: EncoderCard,
-        run: RunFolder,
-        reference: Reference,
-        path_error: Callable[[Policy], float] | None,
-    ) -> None:
-        self.algorithm, self.sampler = algorithm, sampler
-        self.config, self.card, self.folder = config, card, run
-        self.reference, self.path_error = reference, path_error
-        self.step = 0
-        self.settle: Callable[[], None] = lambda: None
-        """Brings algorithm and sampler up to date when a stack makes the updates."""
 
     def begin(self, title: str) -> AbstractContextManager[Loop]:
         """Open the training loop, resuming from the newest checkpoint. No progress is shown without a title."""

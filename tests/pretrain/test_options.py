@@ -99,12 +99,8 @@ def test_a_gap_beyond_the_window_is_refused(max_k, window):
     ("settings", "message"),
     [
         ({"max_k": 0}, "--max-k is 0"),
-        ({"codes": 0}, "--codes is 0"),
-        ({"n": -1}, "--n is -1"),
         ({"self_prediction": float("nan")}, "--self-prediction is nan"),
         ({"corruption": "patch", "patch_fill": 256}, "--patch-fill is 256"),
-        ({"corruption": "zero_frames", "zeroed_frames": 0}, "--zeroed-frames is 0"),
-        ({"method": "homer", "homer_codes": -1}, "--homer-codes is -1"),
         ({"action_target": "ordinal"}, "unknown action target 'ordinal'"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
         ({"method": "mik", "history": "none"}, "unknown --history 'none': choose one of method, gru"),

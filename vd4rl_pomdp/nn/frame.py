@@ -227,16 +227,10 @@ class StateFrame(nn.Module):
         std: Sequence[float] = (),
         hidden_share: float = 0.0,
     ) -> None:
-        """Initialise.
+        """For P = `width` coordinates; ValueError if noise, mean or std is neither empty nor of length P.
 
-        Args:
-            width: number of coordinates P.
-            noise: standard deviation of the noise added to each coordinate; empty: no noise.
-            mean, std: statistics that standardise each coordinate; empty: states are not standardised.
-            hidden_share: probability of setting a coordinate to zero, its standardised mean.
-
-        Raises:
-            ValueError: noise, mean or std is neither empty nor of length P.
+        `noise` is the standard deviation of what is added to each coordinate, `mean` and `std` standardise it, and
+        `hidden_share` is the probability of setting it to zero, its standardised mean.
         """
         super().__init__()
         for values in (noise, mean, std):
@@ -249,11 +243,7 @@ class StateFrame(nn.Module):
         """Optimisers need at least one parameter, and weight files one tensor."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Features (..., P) float32: the state itself.
-
-        Raises:
-            UserError: the state has another width, as in earlier versions.
-        """
+        """The state itself; UserError if it has another width, as in earlier versions."""
         if obs.shape[-3] != self.width:
             raise UserError(
                 f"this encoder reads states of {self.width} coordinates, the task's have {obs.shape[-3]}: "
@@ -267,14 +257,9 @@ class StateFrame(nn.Module):
         return len(self.noise) > 0 or self.hidden_share > 0
 
     def observe(self, state: Tensor, key: Tensor) -> Tensor:
-        """Turn states into observations: add noise, standardise, hide coordinates.
+        """Turn states into observations: (..., P) float32, (...,) int64 -> (..., P, 1, 1) float32.
 
-        Args:
-            state: (..., P) float32.
-            key: (...,) int64 keys of the random draws; equal keys give equal noise and hidden coordinates.
-
-        Returns:
-            (..., P, 1, 1) float32.
+        Adds noise, standardises, hides coordinates; equal keys give equal draws.
         """
         if len(self.noise):
             state = (state + draw_normals(key, state.shape[-1]) * self.noise).float()

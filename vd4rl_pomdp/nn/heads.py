@@ -31,16 +31,7 @@ class PairHead(nn.Module):
         self.rest = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
 
     def forward(self, past: Tensor, future: Tensor, pairs: Tensor) -> Tensor:
-        """Outputs for every pair.
-
-        Args:
-            past: (B, T, past_dim).
-            future: (B, T, future_dim).
-            pairs: (P, 2) int64, each (t, k).
-
-        Returns:
-            (B, P, outputs).
-        """
+        """(B, T, past_dim), (B, T, future_dim) and pairs (P, 2) int64, each (t, k) -> (B, P, outputs)."""
         t, k = pairs.unbind(1)
         hidden = self.past(past).index_select(1, t) + self.future(future).index_select(1, t + k)
         if self.k is not None:

@@ -112,16 +112,8 @@ def run_over_next(memory: Memory, x: Tensor, length: Tensor, span: int) -> Tenso
 def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor, span: int | None = None) -> Tensor:
     """Like `run_backward` (or `run_over_next` with a span), but a row's input depends on the state that reads it.
 
-    With MIK's `future_frames`, V = 3: state j reads row j with 1 frame, row j+1 with 2, and later rows with all 3.
-
-    Args:
-        memory: reads rows backwards.
-        versions: V tensors (B, T, I); state j reads row j+i from versions[min(i, V-1)].
-        length: (B,) int64.
-        span: rows per state; None: all up to the window's end.
-
-    Returns:
-        (B, T, H).
+    State j reads row j+i from versions[min(i, V-1)], V tensors (B, T, I). With MIK's `future_frames`, V = 3: state j
+    reads row j with 1 frame, row j+1 with 2, and later rows with all 3.
     """
     last = len(versions) - 1
     batch, rows, _ = versions[0].shape
