@@ -41,18 +41,12 @@ STAGE = "finetune"
 class FeatureBatch(Batch):
     """n-step transitions of representations (see `Transitions` for reward and discount)."""
 
-    z: Tensor
-    """(B, D)."""
-    action: Tensor
-    """(B, A)."""
-    reward: Tensor
-    """(B,)."""
-    discount: Tensor
-    """(B,)."""
-    next_z: Tensor
-    """(B, D)."""
-    next_action: Tensor
-    """(B, A): the dataset's action at next_z; zero at an episode's last row, which has none."""
+    z: Tensor  # (B, D)
+    action: Tensor  # (B, A)
+    reward: Tensor  # (B,)
+    discount: Tensor  # (B,)
+    next_z: Tensor  # (B, D)
+    next_action: Tensor  # (B, A), the dataset's action at next_z; zero at an episode's last row, which has none
 
 
 class FrozenEncoder:
@@ -147,24 +141,19 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
             with disk_errors(kept):
                 features = torch.from_numpy(np.load(kept)).to(frozen.device)
         else:
-            features = _encode(frozen, histories, views)
+            dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
+            features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
+            total = views * frozen.dataset.num_episodes
+            # on a GPU, no_grad avoids compiling, which takes longer than the encoding
+            with torch.no_grad(), ProgressLine("encode", total, "episodes") as progress:
+                for number in range(views):
+                    view, random = frozen.view(number), histories.of_view(number)
+                    for episodes in frozen.groups():
+                        random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
+                        progress.advance(len(episodes))
             with replacing_file(kept) as fresh, fresh.open("wb") as file:
                 np.save(file, features.cpu().numpy())
         _ENCODED[key] = features
-    return features
-
-
-def _encode(frozen: FrozenEncoder, histories: Histories, views: int) -> Tensor:
-    dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
-    features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
-    total = views * frozen.dataset.num_episodes
-    # on a GPU, no_grad avoids compiling, which takes longer than the encoding
-    with torch.no_grad(), ProgressLine("encode", total, "episodes") as progress:
-        for number in range(views):
-            view, random = frozen.view(number), histories.of_view(number)
-            for episodes in frozen.groups():
-                random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
-                progress.advance(len(episodes))
     return features
 
 

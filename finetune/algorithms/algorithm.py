@@ -49,9 +49,7 @@ class Algorithm(ABC):
     """
 
     options: type[Options] = Options
-    """Class of its options."""
     summary: str = ""
-    """One-line description."""
     period: int = 1
     """Number of updates after which the Python control flow repeats, e.g. 2 if every second update trains the actor."""
 

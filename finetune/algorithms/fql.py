@@ -33,7 +33,7 @@ from torch.func import functional_call
 from torch.optim import Optimizer
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.rebrac import NormedCritics
+from finetune.algorithms.rebrac import normed_critics
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.streams import RandomStream
@@ -112,7 +112,7 @@ class FQL(Algorithm):
         device, shape = policy.standardise.mean.device, policy.shape
         self.noise_in = NoiseIn(shape["action_dim"], shape["hidden"]).to(device)
         self.flow = Flow(**shape).to(device)
-        self.critic = NormedCritics(**shape, layers=LAYERS, kind=_gelu(), eps=1e-6).to(device)
+        self.critic = normed_critics(**shape, layers=LAYERS, activation=_gelu(), eps=1e-6).to(device)
         self.target_critic = copy.deepcopy(self.critic)
         learnt = (policy.net, self.noise_in, self.flow, self.critic)
         self.optimiser = Adam([p for module in learnt for p in module.parameters()], learning_rate, fused=True)

@@ -83,7 +83,7 @@ class IQL(Algorithm):
         super().__init__(policy, options, learning_rate, updates, draws)
         dim, action_dim, hidden = (policy.shape[name] for name in ("dim", "action_dim", "hidden"))
         device = policy.standardise.mean.device
-        self.critic = TwinCritic(dim, action_dim, hidden).to(device)
+        self.critic = TwinCritic(lambda: mlp(dim + action_dim, hidden, 1, last=ExactLinear)).to(device)
         self.target_critic = copy.deepcopy(self.critic)
         self.value = mlp(dim, hidden, 1, last=ExactLinear).to(device)
         self.gaussian = Gaussian(action_dim).to(device)

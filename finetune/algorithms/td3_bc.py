@@ -11,7 +11,7 @@ Differences: states are frozen representations, standardised like the authors' s
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -42,12 +42,11 @@ class TD3BCOptions(ReturnOptions):
 
 
 class TwinCritic(nn.Module):
-    """Two independent Q functions: (B, D), (B, A) -> two (B,)."""
+    """Two independent Q functions: (B, D), (B, A) -> two (B,); each is a new network (B, D + A) -> (B, 1)."""
 
-    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
+    def __init__(self, network: Callable[[], nn.Module]) -> None:
         super().__init__()
-        self.first = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
-        self.second = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
+        self.first, self.second = network(), network()
 
     def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         both = torch.cat([z, action], dim=-1)
@@ -73,9 +72,8 @@ class TD3BC(Algorithm):
         self, policy: Policy, options: ReturnOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
-        shape = policy.shape
-        device = policy.standardise.mean.device
-        self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
+        inputs, hidden = policy.shape["dim"] + policy.shape["action_dim"], policy.shape["hidden"]
+        self.critic = TwinCritic(lambda: mlp(inputs, hidden, 1, last=ExactLinear)).to(policy.standardise.mean.device)
         self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
         self.policy_optimiser = Adam(policy.net.parameters(), learning_rate, fused=True)
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)

@@ -56,9 +56,7 @@ class Method:
     least_batch: int = 1
     """Smallest --batch-size; 2 for losses that contrast windows with each other."""
     options: type[Options] = Options
-    """Class of the method's options."""
     summary: str = ""
-    """One-line description."""
 
 
 _OWN = {

@@ -152,7 +152,7 @@ MUTANTS = [
     (Reading, stacks_take_the_steps_of_single_runs, "runs of Reading cannot be stacked .*data-dependent"),
     (Mixing, stacks_take_the_steps_of_single_runs, "a stacked run differs from a single one: .*bc_loss by"),
     (Unbounded, actions_lie_within_their_bounds, "one has the size"),
-    (Writing, a_batch_is_left_as_it_was, "it changed reward"),
+    (Writing, a_batch_is_left_as_it_was, "it changed: reward"),
 ]
 
 

@@ -43,9 +43,7 @@ class FrameEncoderPart:
     [-0.5, 0.5]. Its optional attribute `found` is a dict of option values known only after building, such as the hash
     of the weights that a model name stands for; the encoder's config records them."""
     options: type[FrameOptions] = FrameOptions
-    """Class of its options."""
     summary: str = ""
-    """One-line description."""
 
 
 class FrameEncoder(nn.Module):

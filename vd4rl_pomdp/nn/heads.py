@@ -66,13 +66,12 @@ def all_pairs(rows: int, max_k: int) -> Tensor:
 def info_nce(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
     """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of identifying each anchor's positive.
 
+    Mean over anchors and leading dimensions, in nats; log(number of candidates) for constant scores.
+
     Args:
         scores: (..., N, N), anchors by candidates; positives are on the diagonal.
         group: (N,) int64; candidates of the anchor's own group are not used as negatives. None: all are.
         real: (N,) bool; rows where it is False are neither anchors nor candidates. None: all count.
-
-    Returns:
-        Mean over anchors and leading dimensions, in nats; log(number of candidates) for constant scores.
     """
     real = _unless_all(real)
     logits = _logits(scores, group, real)

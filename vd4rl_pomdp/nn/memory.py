@@ -28,9 +28,7 @@ class MemoryPart:
     build: Callable[[int, Any], Memory]
     """Called with (input width I, options); usually the memory's class."""
     options: type[MemoryOptions] = MemoryOptions
-    """Class of its options."""
     summary: str = ""
-    """One-line description."""
 
 
 def _refuse_part(name: str, part: MemoryPart) -> None:

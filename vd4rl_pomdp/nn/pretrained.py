@@ -33,8 +33,11 @@ class Pretrained(nn.Module):
         super().__init__()
         if channels % 3:
             raise UserError(f"--frame-encoder pretrained needs frames of 3 channels, not {channels}")
-        model = _load(name)
-        found = _content(model)
+        model, content = _load(name), hashlib.blake2b(digest_size=16)
+        for key, value in sorted(model.state_dict().items()):
+            content.update(f"{key} {tuple(value.shape)}".encode())
+            content.update(value.contiguous().numpy().tobytes())
+        found = content.hexdigest()
         if weights not in ("", found):
             raise UserError(
                 f"--model {name}: its weights are {found} by content, not {weights}: name the folder of those"
@@ -79,12 +82,3 @@ def _load(name: str) -> Any:
             "where there is a network, or name a folder that transformers' save_pretrained wrote"
         ) from error
     return model.eval().requires_grad_(False)
-
-
-def _content(model: nn.Module) -> str:
-    """Content hash of a model's weights: 32 hex digits."""
-    found = hashlib.blake2b(digest_size=16)
-    for name, value in sorted(model.state_dict().items()):
-        found.update(f"{name} {tuple(value.shape)}".encode())
-        found.update(value.contiguous().numpy().tobytes())
-    return found.hexdigest()
