@@ -120,14 +120,14 @@ _ENCODED: WeakValueDictionary[tuple[str, str, int], Tensor] = WeakValueDictionar
 """Features still in use by a training in this process, by everything that determines them."""
 
 
-def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path, encoder: str) -> Tensor:
+def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, cached: Path, encoder: str) -> Tensor:
     """Encode the whole dataset under `views` draws, or reuse the features from this process or from this run's file.
 
     Args:
         frozen: the encoder and its dataset.
         histories: which features there are.
         views: number of draws of corruption and shift.
-        kept: file of the features for resuming; the run itself checks that dataset and encoder are unchanged.
+        cached: file of the features for resuming; the run itself checks that dataset and encoder are unchanged.
         encoder: hash of the encoder's weights (`encoder_hash`).
 
     Returns:
@@ -137,9 +137,9 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
     """
     key = frozen.name(encoder), histories.name(), views
     if (features := _ENCODED.get(key)) is None:
-        if kept.exists():
-            with disk_errors(kept):
-                features = torch.from_numpy(np.load(kept)).to(frozen.device)
+        if cached.exists():
+            with disk_errors(cached):
+                features = torch.from_numpy(np.load(cached)).to(frozen.device)
         else:
             dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
             features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
@@ -151,7 +151,7 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
                     for episodes in frozen.groups():
                         random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
                         progress.advance(len(episodes))
-            with replacing_file(kept) as fresh, fresh.open("wb") as file:
+            with replacing_file(cached) as fresh, fresh.open("wb") as file:
                 np.save(file, features.cpu().numpy())
         _ENCODED[key] = features
     return features

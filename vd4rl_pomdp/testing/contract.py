@@ -66,13 +66,13 @@ def claim_close(found: Tensor, expected: Tensor, otherwise: str, tolerance: floa
 def claim_equal(found: Mapping[str, Tensor], expected: Mapping[str, Tensor], otherwise: str) -> None:
     """Raise AssertionError with the message `otherwise` and the names of the tensors that differ, if any do."""
     differing = [key for key, value in found.items() if not torch.equal(value, expected[key])]
-    claim(differing == [], f"{otherwise}: {shown(differing)}")
+    claim(differing == [], f"{otherwise}: {listed(differing)}")
 
 
 def claim_gradients(parameters: Iterable[tuple[str, Tensor]]) -> None:
     """Raise AssertionError unless every named parameter has a nonzero gradient."""
     without = [name for name, value in parameters if value.grad is None or not value.grad.any()]
-    claim(without == [], f"none reaches {shown(without)}")
+    claim(without == [], f"none reaches {listed(without)}")
 
 
 def weighted_sum(values: Tensor) -> Tensor:
@@ -100,6 +100,6 @@ def reloaded(encoder: Encoder) -> Encoder:
     return loaded
 
 
-def shown(names: Iterable[str]) -> str:
+def listed(names: Iterable[str]) -> str:
     """Sorted names, joined for a message; "none" if there are none."""
     return ", ".join(sorted(names)) or "none"

@@ -56,9 +56,9 @@ def features_have_one_shape(name: str, **options: Any) -> None:
     assert isinstance(frame, FrameEncoder)
     with torch.no_grad():
         flat, windows, floats = frame(obs), frame(obs.view(2, 3, *obs.shape[1:])), frame(obs.float())
-    for given, shape in ((flat, (6, width)), (windows, (2, 3, width)), (floats, (6, width))):
-        claim((tuple(given.shape), given.dtype) == (shape, torch.float32), f"{tuple(given.shape)} {given.dtype}")
-        claim(given.isfinite().all(), "some are not finite")
+    for z, shape in ((flat, (6, width)), (windows, (2, 3, width)), (floats, (6, width))):
+        claim((tuple(z.shape), z.dtype) == (shape, torch.float32), f"{tuple(z.shape)} {z.dtype}")
+        claim(z.isfinite().all(), "some are not finite")
     claim_close(windows.flatten(0, 1), flat, "windows give other features than a batch", 1e-5)
     claim_close(floats, flat, "float images give other features than uint8", 1e-5)
 

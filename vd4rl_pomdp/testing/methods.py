@@ -24,8 +24,8 @@ from vd4rl_pomdp.testing.contract import (
     claim_close,
     claim_equal,
     claim_gradients,
+    listed,
     run_checks,
-    shown,
     streamed,
 )
 
@@ -120,7 +120,7 @@ def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
     for key, value in logs.items():
         claim(value.numel() == 1, f"{key} is logged with shape {tuple(value.shape)}")
         claim(not value.requires_grad, f"{key} is logged with its graph: detach it")
-    claim("loss" in logs, f"no `loss` is logged, only {shown(logs)}")
+    claim("loss" in logs, f"no `loss` is logged, only {listed(logs)}")
     claim(torch.equal(logs["loss"], loss.detach()), f"{logs['loss'].item()} is logged, the loss is {loss.item()}")
 
 
