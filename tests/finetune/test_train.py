@@ -259,6 +259,14 @@ def test_the_clean_evaluation_may_have_another_number_of_episodes_and_is_made_up
     assert find_results([run])[0].id == find_results([whole])[0].id
 
 
+def test_the_cost_of_the_pretraining_comes_along_with_a_copied_encoder(encoder, data, tmp_path):
+    few = {"updates": 2, "batch_size": 4, "eval_episodes": 0}
+    first = run_finetune(smoke_finetune(encoder, data, tmp_path / "first", **few)).path
+    again = run_finetune(smoke_finetune(first / "encoder", data, tmp_path / "again", **few)).path
+    told = [json.loads(path.read_text()) for path in (encoder.parent / "timing.json", again / "pretrain_timing.json")]
+    assert told[0] == told[1]
+
+
 @pytest.mark.parametrize(("views", "hidden_dim", "threads"), [(1, 32, 1), (0, 32, 2), (1, 513, 2)])
 def test_small_networks_are_updated_by_one_thread(encoder, data, tmp_path, monkeypatch, views, hidden_dim, threads):
     """Several would wait for each other between small products."""
