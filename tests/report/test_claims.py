@@ -46,8 +46,8 @@ def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
         "both pay: mik+a above acro": (520, 210),
         "mik+a is above every other method": (520, 320),
         "with nothing hidden, mik+a is not below acro": (590, 610),
-        "what is left to a memory that was told the states": (705, 520),
-        "what is left to the states themselves": (760, 520),
+        "what a memory trained on the states adds": (705, 520),
+        "what the states themselves add": (760, 520),
     }
     assert rows[ACTIONS]["difference"] == pytest.approx(200)
     found = scipy.stats.ttest_ind([500, 540], [310, 330], equal_var=False).confidence_interval(0.95)
@@ -178,12 +178,12 @@ def test_runs_of_like_settings_are_compared_and_not_the_best_of_each_side(tmp_pa
 def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, settings, words):
     write(tmp_path, GOOD | {("mik+a", "patch"): (), ("mik+a", "none"): ()})
     rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, **settings))
-    for claim in (ACTIONS, FIRST, "what is left to a memory that was told the states"):
+    for claim in (ACTIONS, FIRST, "what a memory trained on the states adds"):
         row = rows[claim]
         assert (row["verdict"], row["difference"], row["low"]) == (f"not judged: other {words}", None, None)
         assert 910 in (round(row["left_return"]), round(row["right_return"])), "both sides are shown"
     assert rows[MEMORY]["verdict"] == "holds"
-    states = rows["what is left to the states themselves"]
+    states = rows["what the states themselves add"]
     assert (states["verdict"], states["difference"]) == ("", pytest.approx(760 - 910)), "states are not pretrained"
 
 

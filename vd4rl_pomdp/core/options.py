@@ -207,7 +207,6 @@ def refuse_options(kind: Any, base: type[Options] = Options) -> None:
         base: required base class.
     """
     if not (isinstance(kind, type) and issubclass(kind, base)):
-        raise UserError(
-            f"its options are {kind!r}: name a dataclass that is derived from {base.__module__}.{base.__name__}"
-        )
+        public = base.__module__.replace("vd4rl_pomdp.core.", "vd4rl_pomdp.")
+        raise UserError(f"its options are {kind!r}: name a dataclass that is derived from {public}.{base.__name__}")
     flat(kind.fill({}))

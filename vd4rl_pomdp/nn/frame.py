@@ -219,13 +219,11 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
         "nature": FrameEncoderPart(
             _nature, summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost"
         ),
-        "nature_half": FrameEncoderPart(_nature_half, summary="nature on pictures of half the resolution"),
-        "small": FrameEncoderPart(
-            _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
-        ),
-        "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels: the paper's on mazes"),
+        "nature_half": FrameEncoderPart(_nature_half, summary="nature at half the resolution"),
+        "small": FrameEncoderPart(_small, summary="three strided convolutions of few channels, for grey 50x50 images"),
+        "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels, as in the paper's mazes"),
         "pretrained": FrameEncoderPart(
-            _pretrained, PretrainedOptions, "a frozen image model that transformers knows by name, DINOv2 by default"
+            _pretrained, PretrainedOptions, "a frozen image model from Hugging Face transformers, DINOv2 by default"
         ),
         "flat": FrameEncoderPart(_flat, summary="no convolution, for observations of a few numbers"),
     },

@@ -214,7 +214,7 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
             axes.scatter(mine, place + spread, 7, color=colour, ec="black", lw=0.4, zorder=4)
             if row["best_score"] > row["score"]:
                 axes.scatter(row["best_score"], place, 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
-            names.append(plain(row["label"] + (f" (×{row['absent']})" if row["absent"] else ""), NAME_WIDTH))
+            names.append(plain(row["label"] + (f" ({row['absent']} missing)" if row["absent"] else ""), NAME_WIDTH))
         axes.set_yticks(range(len(rows)), names, fontsize=7)
         axes.set_ylim(max(len(rows), 4) - 0.4, -0.6)
         axes.grid(axis="y", visible=False)
@@ -229,8 +229,8 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
 
     caption = (
         "Final scores under {}. Bars: mean over seeds at the last evaluation; lines: 95% t intervals over seeds and "
-        "episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; ×2: two "
-        "seeds are missing, unfinished or diverged."
+        "episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; missing: "
+        "seeds without a finished run."
     )
     scored = summary[summary["score"].notna()]
     return _plots(

@@ -300,8 +300,8 @@ CLAIMS = (
     ReturnClaim("mik+a above fj+a", _MIK_A, Contender("fj+a"), family=SECOND),
     ReturnClaim("mik+a is above every other method", _MIK_A, Contender()),
     ReturnClaim("with nothing hidden, mik+a is not below acro", _MIK_A, _ACRO, hidden=False, kind="not below"),
-    ReturnClaim("what is left to a memory that was told the states", Contender("supervised+a"), _MIK_A, kind=DISTANCE),
-    ReturnClaim("what is left to the states themselves", Contender("state", clean=True), _MIK_A, kind=DISTANCE),
+    ReturnClaim("what a memory trained on the states adds", Contender("supervised+a"), _MIK_A, kind=DISTANCE),
+    ReturnClaim("what the states themselves add", Contender("state", clean=True), _MIK_A, kind=DISTANCE),
 )
 
 
