@@ -8,7 +8,7 @@ import scipy.stats
 
 from tests.helpers_report import describe, write_run, write_seeds
 from vd4rl_pomdp.report import print_summary, write_report
-from vd4rl_pomdp.report.gates import CLAIMS, judge_claims
+from vd4rl_pomdp.report.gates import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -41,9 +41,9 @@ def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
     shown = {claim: (round(row["left_return"]), round(row["right_return"])) for claim, row in rows.items()}
     assert shown == {
         "acro returns less where pixels are hidden": (610, 210),
-        "a memory pays: mik above acro": (320, 210),
-        "past actions pay: mik+a above mik": (520, 320),
-        "both pay: mik+a above acro": (520, 210),
+        "memory helps: mik above acro": (320, 210),
+        "past actions help: mik+a above mik": (520, 320),
+        "both help: mik+a above acro": (520, 210),
         "mik+a is above every other method": (520, 320),
         "with nothing hidden, mik+a is not below acro": (590, 610),
         "what a memory trained on the states adds": (705, 520),
@@ -233,3 +233,9 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, "one seed of mik is higher"
     assert f"{ACTIONS} (primary): holds in 0 of 1 setting; too few seeds in 1" in shown
     assert "told the states" not in shown
+
+
+def test_the_tally_counts_unjudged_settings_once_and_by_reason():
+    verdicts = ["not judged: other data", "undecided", "holds", "not judged: other data", "not judged: other readout"]
+    rows = [{"kind": "above", "verdict": verdict} for verdict in verdicts]
+    assert tally(rows) == "holds in 1 of 5 settings; undecided in 1; not judged in 3 (2 other data, 1 other readout)"

@@ -43,6 +43,8 @@ NOT_RECORDED = "convergence is not recorded"
 GATED = (*SETTING, "algorithm")
 _place = itemgetter(*GATED)
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
+UNJUDGED = "not judged: "
+"""How the verdict on a claim begins where nothing is judged, before the reason."""
 NOT_REFUTED = "not refuted"
 """Verdict of an undecided "not below" claim."""
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
@@ -292,10 +294,10 @@ class ReturnClaim(NamedTuple):
 _MIK_A, _MIK, _ACRO = Contender("mik+a"), Contender("mik"), Contender("acro")
 CLAIMS = (
     ReturnClaim("acro returns less where pixels are hidden", Contender("acro", clean=True), _ACRO),
-    ReturnClaim("a memory pays: mik above acro", _MIK, _ACRO, family=PRIMARY),
-    ReturnClaim("a memory pays: acro with a GRU above acro", Contender("acro", "gru"), _ACRO, family=PRIMARY),
-    ReturnClaim("past actions pay: mik+a above mik", _MIK_A, _MIK, family=PRIMARY),
-    ReturnClaim("both pay: mik+a above acro", _MIK_A, _ACRO, family=PRIMARY),
+    ReturnClaim("memory helps: mik above acro", _MIK, _ACRO, family=PRIMARY),
+    ReturnClaim("memory helps: acro with a GRU above acro", Contender("acro", "gru"), _ACRO, family=PRIMARY),
+    ReturnClaim("past actions help: mik+a above mik", _MIK_A, _MIK, family=PRIMARY),
+    ReturnClaim("both help: mik+a above acro", _MIK_A, _ACRO, family=PRIMARY),
     ReturnClaim("mik+a above ah+a", _MIK_A, Contender("ah+a"), family=SECOND),
     ReturnClaim("mik+a above fj+a", _MIK_A, Contender("fj+a"), family=SECOND),
     ReturnClaim("mik+a is above every other method", _MIK_A, Contender()),
@@ -373,12 +375,12 @@ def _decisive(left: list[Run], others: list[Run]) -> Sides:
 
 def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
     if compared.unlike:
-        return f"not judged: other {', '.join(compared.unlike)}"
+        return f"{UNJUDGED}other {', '.join(compared.unlike)}"
     if row["kind"] == DISTANCE:
         return ""
     settled = converged([*compared.left, *compared.right])
     if unranked or not settled:
-        return f"not judged: {NOT_RECORDED if settled is None and not unranked else FAILED}"
+        return f"{UNJUDGED}{NOT_RECORDED if settled is None and not unranked else FAILED}"
     p = row["p"] if row["adjusted_p"] is None else row["adjusted_p"]
     sign = HOLDS if row["difference"] > 0 else FAILS
     found = FEW if p is None else sign if p < stats.LEVEL else OPEN
@@ -386,12 +388,17 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
 
 
 def tally(rows: list[Row]) -> str:
-    """Summary of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
+    """Summary of a claim over its settings: "holds in 1 of 3 settings; undecided in 1; not judged in 1 (1 REASON)"."""
     if rows[0]["kind"] == DISTANCE:
         return ""
     counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
-    held = f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"
-    return "; ".join([held, *(f"{verdict} in {count}" for verdict, count in counts.items())])
+    words = [f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"]
+    reasons = {name.removeprefix(UNJUDGED): counts.pop(name) for name in [*counts] if name.startswith(UNJUDGED)}
+    words += [f"{verdict} in {count}" for verdict, count in counts.items()]
+    if reasons:
+        why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        words.append(f"not judged in {sum(reasons.values())} ({why})")
+    return "; ".join(words)
 
 
 def leads(runs: list[Run]) -> list[Row]:

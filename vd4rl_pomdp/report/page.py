@@ -75,8 +75,8 @@ def _p(row: Row) -> str:
     """A p value, and the one adjusted for its family."""
     if pd.isna(row["p"]):
         return number(None)
-    told = "" if pd.isna(row["adjusted_p"]) else f" ({row['adjusted_p']:.3f})"
-    return f"{row['p']:.3f}{told}"
+    values = [f"{p:.3f}" if p >= 0.0005 else "< 0.001" for p in (row["p"], row["adjusted_p"]) if not pd.isna(p)]
+    return f"{values[0]} ({values[1]})" if len(values) > 1 else values[0]
 
 
 def _smallest(row: Row) -> str:
@@ -93,7 +93,7 @@ SHOWN: dict[str, Columns] = {
         "data's return": ("data_return", 0),
         "state": ("state_share", 2),
         "acro, none": ("acro_share", 2),
-        "its bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
+        "acro's bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
         "best": ("best_share", 2),
         "best – random": ("above_random", "low", "high", 0),
     },
@@ -105,7 +105,7 @@ SHOWN: dict[str, Columns] = {
         "right": lambda row: f"{row['right']}: {row['right_return']:.0f} (n = {row['right_seeds']})",
         "difference": ("difference", "low", "high", 0),
         "p (Holm)": _p,
-        "would be found": _smallest,
+        "detectable difference": _smallest,
         "played clean": ("clean_difference", "clean_low", "clean_high", 0),
     },
     "lead": {
@@ -124,7 +124,7 @@ SHOWN: dict[str, Columns] = {
         "its update": ("best_step", 0),
         "seeds": _count,
         "episodes": "episodes",
-        "not there": "missing",
+        "no result": "missing",
     },
     "aggregate": {
         "corruption": "corruption",
@@ -145,7 +145,7 @@ SHOWN: dict[str, Columns] = {
         "velocity, %": (PROBES[1], 1),
         "return": ("return", 0),
         "seeds": ("seeds", 0),
-        "not there": "missing",
+        "no result": "missing",
     },
     "control": {
         "setting": setting,
@@ -238,8 +238,8 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame) -> Iterator[Bloc
                 note += " --hold-out."
             if name == MARK:
                 note += f" Memory: {mine['memory'].iloc[0]}."
-            if "not there" in shown and not shown["not there"].any():
-                shown = shown.drop(columns="not there")
+            if "no result" in shown and not shown["no result"].any():
+                shown = shown.drop(columns="no result")
             yield block(str(heading), shown, words, note)
 
 
@@ -432,6 +432,6 @@ def print_summary(report: Report, console: Console | None = None) -> None:
         console.print(line, markup=False, highlight=False)
     shown = texts(report.summary, SHOWN[MARK])
     for place, part in shown.groupby("setting", sort=False):
-        missing = ["not there"] if part["not there"].any() else []
+        missing = ["no result"] if part["no result"].any() else []
         console.print(f"memory: {report.summary.loc[part.index[0], 'memory']}", markup=False, highlight=False)
         console.print(terminal(str(place), part[["method", "last evaluation", "seeds", "episodes", *missing]]))
