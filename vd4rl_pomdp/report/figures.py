@@ -302,7 +302,7 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "threshold", "share", marker=None, where="post")
-        axes.set(xlabel="score", ylabel="share of runs above it", ylim=(0, 1.02))
+        axes.set(xlabel="score", ylabel="share of runs above the score", ylim=(0, 1.02))
         axes.set_xlim(rows["threshold"].min(), rows["threshold"].max())
 
     shown = profiles.assign(label=profiles["method"])
@@ -353,12 +353,12 @@ def lead_plots(leads: pd.DataFrame) -> list[Plot]:
 DOTS = {
     "probes": (
         dict(zip(PROBES, ("pose", "velocity"), strict=True)),
-        "error, %",
+        "probe error, % of s.d.",
         "the error of a linear probe of pose and of velocity, in percent of a standard deviation",
     ),
     "errors": (
-        dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
-        "mean squared error",
+        dict(zip(ACTION_ERRORS, ("on the data", "in closed loop"), strict=True)),
+        "action error (MSE)",
         "the mean squared difference of its actions from the data's actor's, on the data and in closed loop",
     ),
 }
