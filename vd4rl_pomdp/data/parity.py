@@ -38,9 +38,8 @@ def canary_frames(task: str, render: Render = "exact") -> np.ndarray:
 def render_info(task: str = CANARY) -> dict[str, Any]:
     """Describe this machine's rendering: mujoco version, GL vendor and renderer, and the hash of the canary frames.
 
-    Args:
-        task: name of the task. For one without golden frames CANARY's are used; for one that is not dm_control's the
-            result is only Gymnasium's version.
+    For a task without golden frames CANARY's are used; for one that is not dm_control's the result is only Gymnasium's
+    version.
     """
     if not isinstance(TASKS.get(task), DMCTask | None):
         return {"gymnasium": gymnasium.__version__}
@@ -85,16 +84,12 @@ def _compare_background(path: Path) -> dict[str, Any]:
     """Compare the median frames of data and environment on the pixels that are static in both."""
     dataset = open_dataset(path)
     if dataset.task is None:
-        raise UserError(
-            f"{path}: cannot tell the task; put the dataset in a folder named after it, such as walker_walk/"
-        )
+        raise UserError(f"{path}: cannot tell the task; put the dataset in a folder named after it (walker_walk/)")
     rows = np.linspace(0, dataset.num_rows - 1, min(dataset.num_rows, 400)).astype(int)
     data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task, dataset.frame_size)
     static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)
     if not static.any():
-        raise UserError(
-            f"{path}: no pixel is static in both the dataset and the environment; its frames are not this task's"
-        )
+        raise UserError(f"{path}: no pixel is static in both dataset and environment; its frames are not this task's")
     result = compare(np.median(ours, 0)[static], np.median(data, 0)[static])
     return {"task": dataset.task, "static_pixels": int(static.sum()), **result}
 
