@@ -24,9 +24,9 @@ def markdown(text: str) -> str:
 
 def code(text: str) -> str:
     """Text as a Markdown code span that is safe in a table cell."""
-    shown = one_line(text).replace("|", r"\|")
-    fence = _fence(shown, 1)
-    return f"{fence}{shown}{fence}" if "`" not in shown else f"{fence} {shown} {fence}"
+    line = one_line(text).replace("|", r"\|")
+    fence, space = _fence(line, 1), " " * ("`" in line)
+    return f"{fence}{space}{line}{space}{fence}"
 
 
 def code_block(lines: list[str], language: str) -> list[str]:

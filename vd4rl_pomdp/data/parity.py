@@ -30,9 +30,14 @@ _OFF_BY = 8
 _STATIC_STD = 2.0
 
 
-def canary_frames(task: str, render: Render = "exact") -> np.ndarray:
-    """The golden states rendered on this machine: (F, 3, 84, 84) uint8."""
-    return _show_golden_states(task, _golden_env(task, render))
+def canary_frames(task: str, render: Render = "exact", env: DMCEnv | None = None) -> np.ndarray:
+    """The golden states rendered on this machine, in `env` if given: (F, 3, 84, 84) uint8."""
+    env = env or _golden_env(task, render)
+    camera, frames = FrameCamera(env.physics), []
+    for state in _golden()[f"{task}/physics"]:
+        start_from(env.simulator, state)
+        frames.append(camera.frame())
+    return np.stack(frames)
 
 
 def render_info(task: str = CANARY) -> dict[str, Any]:
@@ -45,7 +50,7 @@ def render_info(task: str = CANARY) -> dict[str, Any]:
         return {"gymnasium": gymnasium.__version__}
     task = task if task in golden_tasks() else CANARY
     env = _golden_env(task, "exact")  # its GL context must live while its strings are read
-    frames = _show_golden_states(task, env)
+    frames = canary_frames(task, env=env)
     return {"mujoco": mujoco.__version__, **gl_strings(), "canary": frames_hash(frames)}
 
 
@@ -114,14 +119,6 @@ def _golden_env(task: str, render: Render) -> DMCEnv:
     played = TASKS.named(task)
     assert isinstance(played, DMCTask), "Gymnasium environments have no golden frames"
     return DMCEnv(played, render)
-
-
-def _show_golden_states(task: str, env: DMCEnv) -> np.ndarray:
-    camera, frames = FrameCamera(env.physics), []
-    for state in _golden()[f"{task}/physics"]:
-        start_from(env.simulator, state)
-        frames.append(camera.frame())
-    return np.stack(frames)
 
 
 @cache
