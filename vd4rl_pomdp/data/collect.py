@@ -6,7 +6,7 @@ command resumes an interrupted collection and produces the same files.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -237,5 +237,5 @@ def _roll_out(job: _Job) -> EpisodeArrays:
     }
 
 
-_environment = cache(make_env)
+_environment: Callable[..., Any] = cache(make_env)
 """Per process, so that all its episodes share one GL context."""

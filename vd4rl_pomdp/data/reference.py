@@ -39,10 +39,10 @@ class Reference:
         rewards = float(dataset.returns.sum()) / dataset.num_transitions
         hashes = {one.get("actor_sha256") for one in dataset.store.meta["attributes"]}
         actor = None
-        if len(hashes) == 1 and dataset.task in TASKS:
-            sha256 = str(hashes.pop())
-            named = ({"task": dataset.task, "quality": quality, "sha256": sha256} for quality in ("medium", "expert"))
-            actor = next((one for one in named if shipped_file(**one)), None)
+        if len(hashes) == 1 and dataset.task is not None and dataset.task in TASKS:
+            known = {"task": dataset.task, "quality": "", "sha256": str(hashes.pop())}
+            candidates = (known | {"quality": quality} for quality in ("medium", "expert"))
+            actor = next((one for one in candidates if shipped_file(**one)), None)
         return cls(round(float(dataset.returns.mean()), 4), actor, mean_reward=round(rewards, 6))
 
     @classmethod

@@ -34,7 +34,7 @@ class DMCEnv(PixelEnv):
                 f"dm_control's {task.domain} {task.task} has no camera {task.camera}: register the task with one of 0 "
                 f"to {cameras - 1}"
             )
-        self._layout = task.layout or self._found_layout()
+        self._layout = task.layout or self._found_layout(task.camera)
         if size is not None:
             rendering.prepare(self.physics, render, size)
             self._frame_camera = rendering.FrameCamera(self.physics, size, task.camera)
@@ -49,11 +49,11 @@ class DMCEnv(PixelEnv):
         """The layout given by the task, else the one found from the MuJoCo model."""
         return self._layout
 
-    def _found_layout(self) -> Layout:
+    def _found_layout(self, camera: int) -> Layout:
         model = self.physics.model
         self.simulator.reset()  # some tasks have no observation before the first reset
         widths = self.simulator.action_spec().shape[0], len(flat_state(self.simulator)), model.nq
-        travel, beside = _ground_travel(model, self.task.camera)
+        travel, beside = _ground_travel(model, camera)
         joints = list(zip(model.jnt_type, model.jnt_qposadr, model.jnt_limited, model.jnt_bodyid, strict=True))
         turning = [int(start) for kind, start, limited, _ in joints if kind == _JOINT.mjJNT_HINGE and not limited]
         offset = {_JOINT.mjJNT_FREE: 3, _JOINT.mjJNT_BALL: 0}  # a free joint's qpos starts with x, y, z
@@ -150,7 +150,7 @@ def replays(task: DMCTask) -> bool:
         model = env.physics.model.ptr
         models.append(np.empty(mujoco.mj_sizeModel(model), np.uint8))
         mujoco.mj_saveModel(model, None, models[-1])
-    return np.array_equal(*models)
+    return np.array_equal(models[0], models[1])
 
 
 def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
