@@ -85,8 +85,7 @@ class StageConfig:
     def of(cls, preset: str = "paper", **settings: Any) -> Self:
         """Build the config from values by name, of the stage's own settings and of the chosen plug-ins' options.
 
-        Raises:
-            UserError: an unknown preset or plug-in, a setting that nothing reads, or one defined twice.
+        UserError for an unknown preset or plug-in, or a setting that nothing reads.
         """
         values = cls.defaults(preset) | settings
         parts = cls.parts(values)
@@ -111,8 +110,7 @@ class StageConfig:
     def altered(self, **changes: Any) -> Self:
         """A copy with other settings or plug-ins. Settings that differ from the preset's defaults are kept.
 
-        Raises:
-            UserError: a non-default setting is not read by the newly chosen plug-ins.
+        UserError if one of these is not read by the newly chosen plug-ins.
         """
         usual = self.usual()
         changed = {name: value for name, value in flat(self).items() if value != usual.get(name)}
@@ -147,11 +145,7 @@ def _check_options(config: Any) -> None:
 
 
 def flat(config: Any) -> dict[str, Any]:
-    """All settings of a config by name, including nested options.
-
-    Raises:
-        UserError: two settings share a name, so one flag would set both and a record could hold only one.
-    """
+    """All settings of a config by name, with nested options; UserError if two share a name and thus a flag."""
     found: dict[str, Any] = {}
     owners: dict[str, str] = {}
 

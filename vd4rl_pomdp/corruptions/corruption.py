@@ -226,8 +226,7 @@ class CorruptionConfig(Options):
     def of(cls, corruption: str = "none", corruption_mode: Mode = "resample", **options: Any) -> Self:
         """Build a config by name, such as `CorruptionConfig.of("patch+zero_frames", patch_size=32)`.
 
-        Raises:
-            UserError: an unknown or repeated name, an option that no stage has, or one that two stages have.
+        UserError for an unknown or repeated name, an option that no stage has, or one that two stages have.
         """
         config = cls.fill({"corruption": corruption, "corruption_mode": corruption_mode} | options)
         known = flat(config)
@@ -271,17 +270,9 @@ class Corruption:
         self._by_pixel = all(tells_pixels(stage) for stage in stages)
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
-        """Corrupted copy of a batch.
+        """Corrupted copy of (..., C, H, W) uint8 stacks; `obs` itself if the corruption is "none".
 
-        Args:
-            obs: (..., C, H, W) uint8, C = 3 * stacked frames.
-            key: (...,) int64 on the same device, one per stack; equal keys give equal masks.
-
-        Returns:
-            uint8 like `obs`; `obs` itself (no copy) if the corruption is "none".
-
-        Raises:
-            UserError: keys of another shape or dtype.
+        `key` are (...,) int64 on the same device, one per stack; equal keys give equal masks. UserError for others.
         """
         if self._nothing:
             return obs

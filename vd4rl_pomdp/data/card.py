@@ -47,11 +47,7 @@ HOW = {
 
 
 def write_card(path: Path) -> Path:
-    """Write `card.md` and `card.png` to a data set's folder `path`; returns the path of card.md.
-
-    Raises:
-        UserError: `path` is not a folder or not writable, or the data set is damaged or incomplete.
-    """
+    """Write `card.md`, whose path is returned, and `card.png`; UserError for a damaged, incomplete or read-only set."""
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)

@@ -25,14 +25,8 @@ Index = int | Sequence[int] | np.ndarray | Tensor
 def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
     """Open a V-D4RL data set: a folder of shards, or a single shard.
 
-    The first call decodes it into a cache; later calls memory-map that and take well under a second.
-
-    Args:
-        path: folder of shards, or one file.
-        cache: folder of decoded data sets; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
-
-    Raises:
-        UserError: it is missing, empty, damaged, incomplete, part of a published data set, or has frames of two sizes.
+    The first call decodes it into `cache`, by default `$VD4RL_POMDP_CACHE` or the user's cache folder; later calls
+    memory-map that. UserError for one that is missing, damaged, incomplete, or with frames of two sizes.
     """
     path = Path(path)
     return Dataset(path, open_store(path, Path(cache) if cache else None))

@@ -39,21 +39,13 @@ def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:
 def download(
     task: str, quality: str, destination: Path, endpoint: str | None = None, verify: bool = False
 ) -> list[Path]:
-    """Download one data set into `destination/{task}/{quality}/84px`; existing files are not downloaded again.
+    """Download one data set into `destination/{task}/{quality}/84px`; returns its shards.
+
+    Existing files are not downloaded again; files equal to another data set's below `destination` are hard-linked.
 
     Args:
-        task: task name.
-        quality: one of `tasks.QUALITIES`.
-        destination: folder of all downloaded data sets; files equal to another data set's there are hard-linked.
         endpoint: address of the Hub or a mirror, without `/datasets`; None: `default_endpoint`.
         verify: also check the SHA-256 of existing files; by default only their size is checked.
-
-    Returns:
-        The data set's shards.
-
-    Raises:
-        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, a full disk, or another
-            process is downloading the data set.
     """
     check_published([task], [quality])
     endpoint = default_endpoint() if endpoint is None else endpoint

@@ -41,13 +41,8 @@ _REPAIR = "download or collect it again"
 def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
     """Write one shard atomically (one writer at a time). Equal input gives equal bytes.
 
-    Args:
-        path: the shard's file.
-        rows: arrays by key, of equal length, as in the module's table; converted to its dtypes.
-        attributes: JSON values to store with the shard: `task`, `set` (the quality), seed, versions.
-
-    Raises:
-        UserError: frames are not uint8, the disk is full or the folder not writable; no partial file remains.
+    `rows` are arrays by key, of equal length, as in the module's table; they are converted to its dtypes, but UserError
+    for frames that are not uint8. `attributes` are JSON values: `task`, `set` (the quality), seed, versions.
     """
     if (dtype := np.asarray(rows.get(FRAMES_KEY, np.uint8(0))).dtype) != np.uint8:
         raise UserError(f"{path}: {FRAMES_KEY} is {dtype}; frames must be uint8, from 0 to 255")

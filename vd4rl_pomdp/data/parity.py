@@ -69,10 +69,7 @@ def compare(rendered: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
 
 
 def check_parity(path: Path | None = None) -> dict[str, Any]:
-    """Compare canary frames with golden ones, and a data set's static background with the environment's.
-
-    Args:
-        path: a data set; None: compare only the canaries.
+    """Compare canary frames with golden ones, and the static background of a data set, if any, with the environment's.
 
     Returns:
         `render`, `canary` (a comparison per task), `background` (a comparison, or None), and `equal`: the background's

@@ -87,11 +87,7 @@ def action_error(action: np.ndarray, actors: np.ndarray) -> np.floating:
 
 
 def summarise(rows: list[dict[str, Any]], reference: Reference) -> dict[str, float | None]:
-    """Summary of one policy's episodes under one corruption; None if unknown.
-
-    Returns:
-        `score_mean`, `score_min`, `score_max`, `return_mean`, `share_above_80` (see `Reference`), `action_error`.
-    """
+    """Summary of one policy's episodes under one corruption: scores, returns, `share_above_80`; None if unknown."""
     scores, returns = ([row[name] for row in rows] for name in ("score", "return"))
     errors = [row["action_error"] for row in rows if row["action_error"] is not None]
     return {

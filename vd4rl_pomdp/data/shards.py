@@ -46,9 +46,6 @@ def collect_set(
     """Write a data set's missing files: collection.json with its settings first, then shards, then provenance.json.
 
     Args:
-        out: folder of the data set.
-        settings: the settings that identify it.
-        shards: all shards of the data set.
         roll_out: plays a job and returns its rows by key.
         workers: number of processes; 0: one per core.
         title: title of the progress bar, and its unit, such as ("collect", "episodes").

@@ -52,16 +52,10 @@ def import_set(
     Args:
         name: name of the format in `FORMATS`.
         source: path or name of the data set.
-        out: folder to write.
         task: task name, if the source does not state it or to override it.
-        quality: name of the behaviour policy.
         size: height and width to resize images to, by area averaging; None: no resizing.
         picture: name of the observation that holds the images, if there are several.
         clip_actions: whether actions outside the source's bounds are clipped; otherwise they are refused.
-
-    Raises:
-        UserError: the source is missing, damaged or has no images, actions are out of bounds, or the folder holds
-            something else.
     """
     refuse_inside(out)
     with _errors_of(source):
@@ -105,11 +99,7 @@ def import_set(
 
 
 def export_set(name: str, path: Path, out: Path, size: int | None = None) -> None:
-    """Convert a data set of this package to another format; `size` as in `import_set`.
-
-    Raises:
-        UserError: the format is read-only, the data set is damaged, or `out` is not empty.
-    """
+    """Convert a data set of this package to another format; `size` as in `import_set`."""
     form = FORMATS.named(name)
     if form.write is None:
         writable = [other for other, one in FORMATS.items() if one.write]

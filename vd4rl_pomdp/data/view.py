@@ -25,10 +25,7 @@ class View:
     """A data set with the random shift and corruption applied to its observations, and their random streams.
 
     Args:
-        dataset: the data set; batches are on its device.
-        corruption: config or name of the corruption; None: none.
         shift: largest random shift in pixels.
-        seed: the run's seed.
         name: name of the view's random streams, which distinguishes the views of a run.
         frame_stack: frames per observation.
         shared: whether all observations of a window get the same shift, or only the frames of one observation.
@@ -52,14 +49,10 @@ class View:
         self._pad, self._frame_stack, self._shared = shift, frame_stack, shared
 
     def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
-        """Observations of rows. On a CPU, with a shift, frames that the corruption zeroes are never read.
+        """Observations (N, ..., C, H, W) uint8, C = 3 * frame_stack, of rows (N, ...) int64.
 
-        Args:
-            rows: (N, ...) int64; all observations under one leading index get the same shift if `shared` is "window".
-            shift_key: (N,) int64 keys of the shifts; None: the next keys of the view's stream.
-
-        Returns:
-            (N, ..., C, H, W) uint8, C = 3 * frame_stack.
+        `shift_key` are (N,) int64 keys of the shifts; None: the next of the view's stream. On a CPU, with a
+        shift, frames that the corruption zeroes are never read.
         """
         if shift_key is None:
             shifts = len(rows) if self._shared == "window" else rows.numel()
@@ -178,11 +171,8 @@ class View:
 class StateView(View):
     """Simulator states instead of pixels, as the input of an encoder of states.
 
-    Args:
-        dataset: a data set with simulator states.
-        observed: `StateFrame.observe`: (..., P) states and (...,) int64 keys -> (..., P, 1, 1) observations.
-        corruption: only its mode is used, to draw the keys; its stages change pixels.
-        seed, name: as in `View`.
+    `observed` is `StateFrame.observe`: (..., P) states and (...,) int64 keys -> (..., P, 1, 1) observations. Of the
+    corruption only its mode is used, to draw the keys; its stages change pixels.
     """
 
     def __init__(
