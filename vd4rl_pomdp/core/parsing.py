@@ -35,14 +35,14 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
             raise UserError(f"{name} is empty: is a shell variable unset? (see `{program} --help`)")
     words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
     options = {} if default is None else {"default": default}
-    shown = io.StringIO()
+    stderr = io.StringIO()
     try:
-        with contextlib.redirect_stderr(shown):
+        with contextlib.redirect_stderr(stderr):
             parsed = tyro.cli(config, args=words, prog=program, config=_TYRO, **options)
     except SystemExit as end:
         if end.code != 2:
             raise
-        lines = (line for line in shown.getvalue().splitlines() if not line.startswith(("╭", "╰")))
+        lines = (line for line in stderr.getvalue().splitlines() if not line.startswith(("╭", "╰")))
         text = re.sub(r"[\u2500-\u257f]+|-{5,}", " ", " ".join(lines).partition("For full helptext")[0])
         raise UserError(f"{' '.join(text.split())} (see `{program} --help`)") from None
     parsed_values = parsed.keywords if isinstance(parsed, partial) else vars(parsed)

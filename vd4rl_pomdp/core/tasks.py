@@ -129,8 +129,8 @@ class DMCTask(Task):
     def summary(self) -> str:
         """One-line description."""
         own = "." in self.domain
-        shown = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
-        return f"{shown}, camera {self.camera}, {super().summary}"
+        title = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
+        return f"{title}, camera {self.camera}, {super().summary}"
 
 
 @dataclass(frozen=True)

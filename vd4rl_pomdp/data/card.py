@@ -94,11 +94,11 @@ def _film(
 ) -> np.ndarray:
     """Evenly spaced frames (FILM_FRAMES, 3, S, S) of the episode with the median return."""
     episode = int(np.argsort(returns)[len(returns) // 2])
-    wanted = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
+    rows = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
     offsets = np.cumsum([0, *counts])
     frames = []
     for shard, first, stop in zip(shards, offsets, offsets[1:], strict=False):
-        inside = np.unique(wanted[(wanted >= first) & (wanted < stop)])
+        inside = np.unique(rows[(rows >= first) & (rows < stop)])
         if len(inside):
             frames.append(read_some_frames(shard, inside - first))
     return np.concatenate(frames)

@@ -195,9 +195,9 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
 
     if step_type[0] != StepType.FIRST:
         fail(0, f"has step_type {step_type[0]}, but the first row of a set begins an episode")
-    astray = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
-    if len(astray):
-        fail(int(astray[0]), "follows an episode's last row without beginning a new one")
+    strays = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
+    if len(strays):
+        fail(int(strays[0]), "follows an episode's last row without beginning a new one")
     for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
         (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
         # without numbers, shards are assumed to be consecutive

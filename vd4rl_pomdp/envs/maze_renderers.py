@@ -241,9 +241,9 @@ def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
     found = np.zeros((*x.shape, 3), np.uint8)
     x, y, z = (side / largest for side in (x, y, z))
     places = ((x == 1, y, -z), (x == -1, -y, -z), (z == 1, x, -y), (z == -1, x, y), (y == -1, x, -z), (y == 1, -x, -z))
-    for face, (there, column, row) in zip(texture.reshape(6, FACE, FACE, 3), places, strict=True):
-        at = [np.minimum(((side[there] + 1) / 2 * FACE).astype(int), FACE - 1) for side in (row, column)]
-        found[there] = face[at[0], at[1]]
+    for face, (mask, column, row) in zip(texture.reshape(6, FACE, FACE, 3), places, strict=True):
+        at = [np.minimum(((side[mask] + 1) / 2 * FACE).astype(int), FACE - 1) for side in (row, column)]
+        found[mask] = face[at[0], at[1]]
     return found
 
 

@@ -60,14 +60,14 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
     data, filmed = files("data", info["data_path"]), features[key]["dtype"] == "video"
     films = files(f"videos/{key}", info["video_path"]) if filmed else []
-    wanted = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
-    low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), wanted)
+    outcomes = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
+    low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), outcomes)
     tasks = [str(one) for one in pq.read_table(folder / "meta" / "tasks.parquet").to_pandas().index]
     named = tasks[0] if len(tasks) == 1 and re.fullmatch(r"[\w.-]+", tasks[0]) else None
     notes += [f"its task is {one!r}" for one in tasks if len(tasks) == 1 and not named]
 
     def read(first: int) -> Iterator[EpisodeArrays]:
-        columns = ["episode_index", "timestamp", "action", *wanted, *([] if filmed else [key])]
+        columns = ["episode_index", "timestamp", "action", *outcomes, *([] if filmed else [key])]
         for number, stored in _stored(data, lengths, columns, first):
             if filmed:
                 times = episodes[f"videos/{key}/from_timestamp"][number] + stored["timestamp"].astype(float)
@@ -131,26 +131,26 @@ def _stored(
                 yield number, stored
 
 
-def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
+def _survey(pq: Any, files: list[Path], outcomes: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
     """Action bounds, if actions exceed [-1, 1], and warnings about unusable or missing values."""
     lows, highs, unused, lost, notes = [], [], 0, 0.0, []
     for file in files:
-        table = pq.read_table(file, columns=["episode_index", "action", *wanted])
+        table = pq.read_table(file, columns=["episode_index", "action", *outcomes])
         action = _dense(table["action"].combine_chunks())
         if action.dtype.kind != "f":
             raise UserError(f"its actions are {action.dtype}; expected floating point")
         lows.append(action.min(0))
         highs.append(action.max(0))
         last = np.flatnonzero(np.diff(table["episode_index"].to_numpy(), append=-1))
-        if "next.done" in wanted:  # a row after the terminal one only holds the final image
+        if "next.done" in outcomes:  # a row after the terminal one only holds the final image
             last = last[~table["next.done"].to_numpy()[np.maximum(last - 1, 0)]]
         unused += len(last)
-        if "next.reward" in wanted:
+        if "next.reward" in outcomes:
             lost += float(_dense(table["next.reward"].combine_chunks())[last].sum())
     if unused:
-        rewards = f" and rewards ({lost:g} in all)" if "next.reward" in wanted else ""
+        rewards = f" and rewards ({lost:g} in all)" if "next.reward" in outcomes else ""
         notes.append(f"the last actions{rewards} of {unused} episodes lead to no stored picture and are left out")
-    if "next.reward" not in wanted:
+    if "next.reward" not in outcomes:
         notes.append("it has no rewards: all are 0")
     low, high = np.min(lows, 0).astype(float), np.max(highs, 0).astype(float)
     if max(-low.min(), high.max()) <= 1:
@@ -227,8 +227,8 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
             film = folder / _VIDEO.format(video_key=_PICTURE, **_numbered("", number))
             _encode(film, pictures)
             if number % 10 == 0:
-                seen = _filmed(film, columns["timestamp"].astype(float), _FPS)
-                change = np.abs(seen.astype(np.int16) - rows[FRAMES_KEY])
+                decoded = _filmed(film, columns["timestamp"].astype(float), _FPS)
+                change = np.abs(decoded.astype(np.int16) - rows[FRAMES_KEY])
                 changes.append((change.mean(), change.max()))
             where = _numbered("", number) | {"from_timestamp": 0.0, "to_timestamp": len(pictures) / _FPS}
             place |= {f"videos/{_PICTURE}/{name}": value for name, value in where.items()}

@@ -76,8 +76,8 @@ def _episode(path: Path) -> EpisodeArrays:
             stored = {key: file[key] for key in file.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
         raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); fetch it again") from error
-    if lacking := [key for key in ("image", "action", "reward") if key not in stored]:
-        raise UserError(f"{path}: has no {lacking[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
+    if missing := [key for key in ("image", "action", "reward") if key not in stored]:
+        raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
     rows = len(stored["reward"])
     for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
         if (count := len(stored.get(key, stored["reward"]))) != rows:
