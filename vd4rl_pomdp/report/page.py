@@ -32,12 +32,9 @@ from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_certificates, refuse_loss, write_results
 
-MARK = "summary"
-"""The table that every report has; its file identifies a report's folder."""
-WIDEST = 6
-"""Maximum methods side by side in a matrix; further ones go below."""
-SEEDS = 12
-"""Maximum seeds that are listed individually."""
+MARK = "summary"  # the table that every report has; its file identifies a report's folder
+WIDEST = 6  # maximum methods side by side in a matrix; further ones go below
+SEEDS = 12  # maximum seeds that are listed individually
 Tables = dict[str, pd.DataFrame]
 Shown = dict[str, tuple[pd.DataFrame, list[Block]]]
 Plots = dict[str, list[Plot]]
@@ -243,8 +240,7 @@ class Report(NamedTuple):
     summary: pd.DataFrame
     gates: list[Row]
     claims: list[Row]
-    unlike: list[str]
-    """Warnings about results that were made with different data or code."""
+    unlike: list[str]  # warnings about results that were made with different data or code
 
 
 def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
