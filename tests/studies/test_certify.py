@@ -60,7 +60,7 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     (told,) = json.loads((out / "certificates.json").read_text()).values()
     assert told["name"] == "patch, patch_size 24"
     assert told["why"].startswith("R2: supervised+a -")
-    assert told["why"].endswith(", too few seeds, too little itself to tell; no returns")
+    assert told["why"].endswith(", too few seeds, itself too low to judge; no returns")
     assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
     assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
     (states / "certificates.json").unlink()

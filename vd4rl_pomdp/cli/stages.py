@@ -151,7 +151,7 @@ def list_parts() -> None:
     import vd4rl_pomdp.data.formats  # noqa: F401
 
     for setting, registry in sorted(REGISTRIES.items()):
-        print(f"{flag_of(setting)}   (packages offer theirs as entry points of {registry.group})")
+        print(f"{flag_of(setting)}   (entry point group {registry.group})")
         print("\n".join(_lines(registry)), end="\n\n")
 
 

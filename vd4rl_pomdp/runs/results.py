@@ -51,32 +51,23 @@ NOT_CERTIFIED = "not certified"
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
 DAMAGED = "its files are damaged", "take another copy, or leave it out"
 """Message for a run whose files do not hold what a run writes."""
-_ROUNDING = 1e-4
-"""Tolerance of a score; scores and returns are stored with four decimals."""
+_ROUNDING = 1e-4  # tolerance of a score; scores and returns are stored with four decimals
 
 
 @dataclass(frozen=True)
 class Result:
     """One run, finished or not, from its own folder or a results folder."""
 
-    id: str
-    """Hash of what the run computes, see `runs.run.identity`."""
-    path: Path
-    """Its folder, or the results folder that lists it."""
-    files: dict[str, dict[str, Any]]
-    """Contents of those FILES that it has."""
-    step: int
-    """Last step in its metrics; 0 if there are none."""
-    losses: list[tuple[int, float]]
-    """Step and action loss over a pretraining."""
-    rows: list[Row]
-    """Evaluation rows, one per episode."""
-    folder: bool = False
-    """Whether `path` is its own folder."""
+    id: str  # hash of what the run computes, see `runs.run.identity`
+    path: Path  # its folder, or the results folder that lists it
+    files: dict[str, dict[str, Any]]  # contents of those FILES that it has
+    step: int  # last step in its metrics; 0 if there are none
+    losses: list[tuple[int, float]]  # step and action loss over a pretraining
+    rows: list[Row]  # evaluation rows, one per episode
+    folder: bool = False  # whether `path` is its own folder
 
     @property
     def place(self) -> str:
-        """Where it is stored, for messages."""
         return str(self.path) if self.folder else f"{self.path}: run {self.id}"
 
     @property
@@ -150,7 +141,6 @@ class Result:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has finished."""
         return "timing" in self.files
 
     @property

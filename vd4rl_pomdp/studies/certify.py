@@ -206,5 +206,5 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
 
     told = [f"{MEMORY} {told_of(row['methods'][MEMORY])}"]
     told += [f"less {floor} {told_of(ends)}" for floor, ends in row["above"].items()]
-    told += ["too few seeds"] * (not known) + ["too little itself to tell"] * (weak and verdict == OPEN)
+    told += ["too few seeds"] * (not known) + ["itself too low to judge"] * (weak and verdict == OPEN)
     return row | {"verdict": verdict, "why": ", ".join(told)}
