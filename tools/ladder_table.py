@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from script import run_script
 
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.text import table_lines
@@ -303,12 +302,7 @@ PANELS = {"return": _draw_returns, "critic": _draw_critic, "cloning loss": _draw
 """Function that draws a run, by panel title."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """Draw results/ladder/ladder.png and print the budgets. No options."""
-
-
-def main(config: Config) -> None:
+def main() -> None:
     """Write the figure and print the budgets."""
     cells = cells_in()
     figure(cells).savefig(RESULTS / "ladder.png", dpi=150)
@@ -316,4 +310,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_script(main, Config)
+    main()

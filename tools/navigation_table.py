@@ -12,18 +12,27 @@ from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.files import groups
 from vd4rl_pomdp.runs.results import RUNS, read_results
-from vd4rl_pomdp.studies.navigation import measures
-from vd4rl_pomdp.studies.navigation.measures import OBJECTIVES, Condition, Measure, paper_number
-from vd4rl_pomdp.studies.navigation.report import Numbers
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_runs, numbers_of
+from vd4rl_pomdp.studies.navigation.runs import (
+    OBJECTIVES,
+    UNTRAINED,
+    Condition,
+    Measure,
+    NavigationRun,
+    Numbers,
+    load_runs,
+    numbers_of,
+    online_error,
+    paper_number,
+    refitted_error,
+)
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
-REFITTED = [measures.refitted_error(component) for component in ("state", "position", "velocity")]
+REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
 """Errors in percent, on held-out trajectories."""
-PAPERS_WAY = [measures.online_error(component).raw() for component in ("state", "position", "velocity")]
+PAPERS_WAY = [online_error(component).raw() for component in ("state", "position", "velocity")]
 """Errors with the paper's protocol and units."""
 REFERENCES = {
-    measures.UNTRAINED: "untrained",
+    UNTRAINED: "untrained",
     "supervised+a": "`supervised+a`",
     "supervised": "`supervised`",
     "supervised_picture": "`supervised_picture`",
@@ -46,12 +55,12 @@ def main_runs() -> list[NavigationRun]:
 def numbers_in(folder: str = ".") -> Numbers:
     """Numbers of the runs of results/navigation, or of a subfolder; empty if it has no runs."""
     place = RESULTS / folder
-    return numbers_of(frame_of(load_runs(read_results(place)))) if (place / RUNS).exists() else {}
+    return numbers_of(load_runs(read_results(place))) if (place / RUNS).exists() else {}
 
 
 def values(numbers: Numbers, condition: Condition, measure: Measure) -> list[float]:
     """One number per seed, in order."""
-    return list(numbers.get((*condition, *measure), {}).values())
+    return list(numbers.get((condition, measure), {}).values())
 
 
 def _mean(numbers: Numbers, condition: Condition, measure: Measure) -> str:
@@ -157,7 +166,7 @@ def picture_lines(usual: Numbers) -> Iterator[str]:
     configs = [(result.record["config"], result) for result in read_results(RESULTS / "first_person" / "pictures")]
     changed = groups(configs, lambda one: PICTURES.get(one[0]["picture"]) or f"rate {one[0]['learning_rate']:g}")
     settings = {"the preset: grey, 50x50, rate 0.002": usual}
-    settings |= {words: numbers_of(frame_of(load_runs(run for _, run in runs))) for words, runs in changed.items()}
+    settings |= {words: numbers_of(load_runs(run for _, run in runs)) for words, runs in changed.items()}
     rows = (
         (words, *(_place_and_speed(numbers, Condition(STARS, name)) for name in methods))
         for words, numbers in settings.items()

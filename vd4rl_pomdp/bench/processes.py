@@ -88,10 +88,7 @@ def touch(frames: torch.Tensor) -> None:
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
     """Peak memory of a process that trains on the dataset in `folder`, and what a second one adds beyond the shared
-    frames.
-
-        Empty where /proc is missing.
-    """
+    frames; empty where /proc is missing."""
     if not _STATUS.exists():
         return {}
     peak, private = next(iter(run_jobs(_train_a_little, [folder, folder], 2)))

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 
 from tests.studies.theory.random_worlds import worlds
-from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash, compare
+from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths, clash, compare
 from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.partition import state_relation
 from vd4rl_pomdp.studies.theory.study import facts
-from vd4rl_pomdp.studies.theory.views import VIEWS
 from vd4rl_pomdp.studies.theory.world import (
     counterexample,
     distances,

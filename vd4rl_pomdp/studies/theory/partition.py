@@ -18,9 +18,8 @@ from itertools import combinations
 
 import numpy as np
 
-from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, first_row
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, ObjectiveView, first_row
 from vd4rl_pomdp.studies.theory.law import Law, Prediction, Variable, joint_law, number_rows
-from vd4rl_pomdp.studies.theory.views import ObjectiveView
 from vd4rl_pomdp.studies.theory.world import World
 
 History = tuple
