@@ -111,12 +111,12 @@ def state_lines(numbers: Numbers, settings: Iterable[tuple[str, Condition]]) -> 
     for words, setting in settings:
         for maze in filter(known, PAPER_MAZES):
             conditions = [setting._replace(maze=maze, method=name) for name in _ORDER]
-            for told, measure in ((words, PAPERS_WAY[0]), (f"{words}, in %", REFITTED[0])):
+            for name, measure in ((words, PAPERS_WAY[0]), (f"{words}, in %", REFITTED[0])):
                 counts = {len(values(numbers, condition, measure)) for condition in conditions} - {0}
                 if counts:
                     seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
                     cells = (_cell(numbers, condition, measure) for condition in conditions)
-                    rows.append((f"{maze.replace('_', ' ')}, {told}", seeds, *cells))
+                    rows.append((f"{maze.replace('_', ' ')}, {name}", seeds, *cells))
     return table_lines(("", "seeds", *(f"`{name}`" for name in _ORDER)), rows)
 
 
@@ -126,8 +126,9 @@ def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
     for method, k in (("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)):
         condition = Condition("three_curtains", method, k)
         seeds = ", ".join(str(len(values(numbers, condition, PAPERS_WAY[0]))) for numbers in (usual, longer))
-        told = (PAPERS_WAY[0], TRAINING_LOSS)
-        cells = (_cell(numbers, condition, one) for one in told for numbers in (usual, longer))
+        cells = (
+            _cell(numbers, condition, one) for one in (PAPERS_WAY[0], TRAINING_LOSS) for numbers in (usual, longer)
+        )
         rows.append((f"`{method}`, K = {k}", seeds, *cells))
     columns = (f"{words}, {steps} steps" for words in ("state error", "action loss") for steps in ("2,500", "20,000"))
     return table_lines(("", "seeds", *columns), rows)
@@ -135,16 +136,16 @@ def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
 
 def first_person_lines(numbers: Numbers) -> Iterator[str]:
     """Errors of everything trained under the compass, by increasing state error."""
-    told = {
+    conditions = {
         f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
         for name in OBJECTIVES
         for words in ("", " with self-prediction")
     } | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
-    state = {name: values(numbers, condition, REFITTED[0]) for name, condition in told.items()}
+    state = {name: values(numbers, condition, REFITTED[0]) for name, condition in conditions.items()}
     parts = (REFITTED, [one._replace(probe="online") for one in REFITTED[1:]])
     rows = []
-    for name in sorted(filter(state.get, told), key=lambda one: np.mean(state[one])):
-        cells = (", ".join(_cell(numbers, told[name], one) for one in part) for part in parts)
+    for name in sorted(filter(state.get, conditions), key=lambda one: np.mean(state[one])):
+        cells = (", ".join(_cell(numbers, conditions[name], one) for one in part) for part in parts)
         rows.append((name, len(state[name]), *cells))
     return table_lines(("", "seeds", "state, position, velocity", "probe beside the model: position, velocity"), rows)
 

@@ -52,7 +52,7 @@ def pages() -> dict[str, Tables]:
             "aggregate": offline.aggregate_lines(returns),
         },
     }
-    return {f"results/{place}/README.md": told for place, told in tables.items()}
+    return {f"results/{place}/README.md": of_page for place, of_page in tables.items()}
 
 
 def with_tables(text: str, tables: Tables, page: str) -> str:

@@ -234,13 +234,13 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
                 update()
 
     in_one = milliseconds(step, device, size.steps, size.blocks) / size.runs
-    told = {"at_once": size.runs, "on_streams_ms": in_one} | peak(device)
+    measured = {"at_once": size.runs, "on_streams_ms": in_one} | peak(device)
     updates.clear()
     free(device)
     given = str(folder), str(device), asdict(size), 4.0 if size is PAPER else 0.1
     answers = apart(f"{__name__}.pretraining_steps", *given, count=size.runs)
     in_processes = 1e3 / sum(answer["steps_per_s"] for answer in answers)
-    return told | {"in_processes_ms": in_processes, "each_ms": min(in_one, in_processes)}
+    return measured | {"in_processes_ms": in_processes, "each_ms": min(in_one, in_processes)}
 
 
 def pretraining_steps(folder: str, device: str, size: dict[str, Any], seconds: float) -> Callable[[], dict[str, Any]]:

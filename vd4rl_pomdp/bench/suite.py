@@ -45,7 +45,7 @@ from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.memory import MEMORIES
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.device import Precision, pick_device
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -127,13 +127,13 @@ def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]],
     for name in ("value", "goal", ""):
         table.add_column(name, justify="right")
     for name, value in flatten(results).items():
-        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
         relation, goal = goals.get(name, ("", 0.0))
-        if relation and float(shown) == goal:
-            shown = str(value)  # do not round a missed goal to the goal
+        if relation and float(text) == goal:
+            text = str(value)  # do not round a missed goal to the goal
         reached = value <= goal if relation == "<=" else value >= goal if relation else None
         verdict = {True: "[green]reached[/]", False: "[red]missed[/]", None: ""}[reached]
-        table.add_row(name, shown, f"{relation} {goal:g}" if relation else "", verdict)
+        table.add_row(name, text, f"{relation} {goal:g}" if relation else "", verdict)
     Console().print(table)
 
 
@@ -351,18 +351,19 @@ def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
     memoryless = EncoderConfig(dataset.action_dim)
     history = replace(memoryless, history="gru", use_actions=True, history_window=HISTORY_WINDOW)
     results: dict[str, float] = {}
-    for kind, encoder_config, precision, rounds in (
-        ("fp32", memoryless, "fp32", repeats // 3),
-        ("bf16", memoryless, "bf16", repeats),
-        ("history_bf16", history, "bf16", 1),
-    ):
+    cases: dict[str, tuple[EncoderConfig, Precision, int]] = {
+        "fp32": (memoryless, "fp32", max(1, repeats // 3)),
+        "bf16": (memoryless, "bf16", repeats),
+        "history_bf16": (history, "bf16", 1),
+    }
+    for kind, (encoder_config, precision, rounds) in cases.items():
         encoder = Encoder(encoder_config).eval().to(device)
         frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch+zero_frames"), config.shift, precision, 0)
         features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
         exact = next_update(config, dataset, encoder.dim, partial(ExactSampler, frozen, NO_OPTIONS, BATCH, 3, 0.99))
         many, few = 20, ALGORITHMS[config.algorithm].period  # a whole period of delayed updates
         updates = _some(many, on_features(config, dataset, features)), _some(few, exact)
-        fast, slow = alternating(max(1, rounds), *updates)
+        fast, slow = alternating(rounds, *updates)
         results |= {f"{kind}_cached_updates_per_s": many / fast, f"{kind}_exact_updates_per_s": few / slow}
         results[f"{kind}_cached_over_exact"] = (slow / few) / (fast / many)
     features = random_features(dataset, 1)
@@ -442,15 +443,9 @@ def next_update(
     runs: int = 1,
     encoder: Encoder | None = None,
 ) -> Callable[[], dict[str, torch.Tensor]]:
-    """A function that makes one training update of a run or a stack, including sampling.
+    """A function that makes one training update of a run, or of a stack of `runs`, including sampling.
 
-    Args:
-        config: settings of the run.
-        dataset: its dataset, on the device.
-        dim: width of representations.
-        batches: makes its sampler from a random stream.
-        runs: number of runs in the stack.
-        encoder: encoder to train, for an end-to-end method.
+    `batches` makes a sampler of (B, dim) representations from a random stream; an end-to-end method trains `encoder`.
     """
     device, trainers = dataset.t.device, []
     unwritten: Any = [None] * 4  # outputs, and the reference to compare results with

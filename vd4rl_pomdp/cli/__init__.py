@@ -107,8 +107,8 @@ def run_to_end(words: Sequence[str]) -> End:
     except FloatingPointError as error:
         return End(1, f"error: training diverged, {error}; lower --learning-rate or use fp32")
     except (KeyboardInterrupt, interrupt.Terminated) as error:  # the message says where training stopped
-        terminated = isinstance(error, interrupt.Terminated)
-        code, how, where = (143, "terminated", error.reason) if terminated else (130, "interrupted", str(error))
+        code, how = (130, "interrupted") if isinstance(error, KeyboardInterrupt) else (143, "terminated")
+        where = getattr(error, "reason", str(error))
         return End(code, f"{how}: {where}{'; ' if where else ''}re-run the same command to resume")
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
         return End(141)

@@ -123,14 +123,9 @@ def _print_plan(jobs: list[Job], stack: int) -> None:
 
 
 def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
-    """Run plans to their end; SystemExit 1 if some jobs are not finished.
+    """Run plans to their end by an executor and its options; SystemExit 1 if some jobs are not finished.
 
-    Args:
-        plans: plans whose jobs are in dependency order.
-        folder: the sweep's folder.
-        kind: name of the executor.
-        options: its options.
-        name: name of the plan; empty for all plans in the folder.
+    `name` is the plan's, empty for all plans in the folder.
     """
     from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
     from vd4rl_pomdp.sweeps.driver import Driver

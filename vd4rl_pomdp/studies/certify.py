@@ -57,14 +57,9 @@ R2_FILE = "r2.json"
 def planned(
     data: Path, corruption: str, out: Path, returns: bool, changes: Sequence[str]
 ) -> tuple[Dataset, list[GridCell], list[Job]]:
-    """The dataset, its cells of the grid, and their jobs in dependency order.
+    """The dataset, its cells of the grid, and their jobs in dependency order, OUT/METHOD/seedN/STAGE.
 
-    Args:
-        data: folder of a dataset with simulator states.
-        corruption: name of a corruption.
-        out: folder of the runs, OUT/METHOD/seedN/STAGE.
-        returns: whether to train policies as well.
-        changes: overrides for the grid, e.g. "pretrain.steps=100" or "seed=0,1".
+    With `returns`, policies are trained as well; `changes` override the grid: "pretrain.steps=100" or "seed=0,1".
     """
     dataset = open_dataset(data)
     dataset.require_states()
@@ -168,14 +163,9 @@ def _returns(folders: Sequence[Path]) -> Row:
 
 
 def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
-    """Verdict: whether the memory scores above both floors.
-
-    Args:
-        values: (seeds, episodes) by method.
-        unit: unit of MARGIN and ENOUGH.
-        digits: decimals in the text.
-    """
-    methods = {
+    """Verdict: whether the memory scores above both floors; (seeds, episodes) by method, `unit` that of MARGIN and
+    ENOUGH, `digits` for the text."""
+    methods: dict[str, Any] = {
         name: (float(scores.mean()), *(mean_interval(scores) or (None, None))) for name, scores in values.items()
     }
     above: dict[str, Any] = {}

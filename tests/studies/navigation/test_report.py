@@ -154,16 +154,6 @@ def test_the_report_made_from_its_own_rows_is_the_same_and_runs_are_added_to_it(
     assert len(loaded(tmp_path / "out")) == 31
 
 
-def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_path):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "README.md").write_text("mine")
-    run = runs / "three_curtains" / "mik-K15" / "seed0"
-    for out in (tmp_path / "mine", runs, run, run / "report"):
-        with pytest.raises(UserError, match="choose another"):
-            write_report([runs], out)
-    assert (tmp_path / "mine" / "README.md").read_text() == "mine"
-
-
 def test_what_was_not_trained_alike_is_said(tmp_path):
     alike = [write_run(tmp_path / "runs", Condition("no_curtain", method), 0, 1.0) for method in ("mik+a", "fj", "ah")]
     longer = write_run(tmp_path / "runs", Condition("no_curtain", "no_history"), 0, 1.0)

@@ -58,8 +58,6 @@ _SMOKE: dict[str, Any] = {
     "checkpoint_every": 10,
 }
 _NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "no_history", "ah", "ah+a"), strict=True))
-
-
 """Objectives whose networks the references have."""
 
 

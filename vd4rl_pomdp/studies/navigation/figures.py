@@ -149,12 +149,8 @@ def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
 def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> None:
     """Write an animated GIF with one panel per name.
 
-    The true mass is a green disc, visible through the curtains here; the estimate is an orange ring.
-
-    Args:
-        trajectories: `trajectory.csv` of runs on that maze, by panel title.
-        maze: maze to draw.
-        path: output file.
+    The true mass is a green disc, visible through the curtains here; the estimate is an orange ring. `trajectories`
+    are the trajectory.csv of runs on that maze.
     """
     tables = {name: read_trajectory(file) for name, file in trajectories.items()}
     ground = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)

@@ -169,7 +169,7 @@ def _read_cifar(path: Path) -> np.ndarray:
         images = np.frombuffer(raw, np.uint8).reshape(-1, labels + 3 * _CIFAR_SIDE**2)[:POOL]
         if not len(images) or (labels and images[:, 0].max() > 9):
             raise ValueError("it holds no images, or labels above 9")
-        return images[:, labels:].reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
+    return images[:, labels:].reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
 
 
 def _to_size(images: np.ndarray) -> Tensor:

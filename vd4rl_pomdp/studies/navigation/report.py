@@ -168,8 +168,8 @@ def table_sections(cells: pd.DataFrame) -> Iterator[str]:
         for view, table in mine.groupby("view", sort=False):
             mazes, rows = table["maze"].unique(), table["row"].unique()
             wide = table.pivot(index="row", columns="maze", values="text").loc[rows, mazes]
-            shown = ((label, *row) for label, row in zip(rows, wide.to_numpy(), strict=True))
-            yield from (f"*{view}*", "", *table_lines(["", *mazes], shown, range(len(mazes) + 1)), "")
+            cells_of_row = ((label, *row) for label, row in zip(rows, wide.to_numpy(), strict=True))
+            yield from (f"*{view}*", "", *table_lines(["", *mazes], cells_of_row, range(len(mazes) + 1)), "")
 
 
 NEAR_ZERO = 5.0
@@ -247,8 +247,8 @@ def claims(maze: str) -> list[Claim]:
             Claim("ah's state error, of mik+a's", of("ah", "state"), ">", 1, of("mik+a", "state")),
         ]
     if MAZES[maze].paper == "first_person":  # the position is known by far where one image does not reveal it
-        for told, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
-            ours = of("mik+a", "state", self_prediction=told)
+        for trained_so, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
+            ours = of("mik+a", "state", self_prediction=trained_so)
             found += [
                 Claim(f"state error of {name}, of the untrained one's", ours, "<", 0.5, of(UNTRAINED, "state")),
                 Claim(f"state error of {name}", ours, "<", FEW),
@@ -295,8 +295,11 @@ def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
         else:
             columns += ["no run yet", "-", "-"]
         columns += ["no error", "-"] if claim.raw() == claim else raw.cells
-        said = raw.paper and f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}"
-        rows.append([*columns, said or "none"])
+        if raw.paper:
+            columns.append(f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}")
+        else:
+            columns.append("none")
+        rows.append(columns)
     judged = [percent.holds for _, _, percent, _ in found if percent.seeds]
     printed = [raw.holds for *_, raw in found if raw.seeds and raw.paper]
     both = [row for row in found if row[-1].seeds and row[1].raw() != row[1]]
@@ -357,13 +360,8 @@ cells: `vd4rl-pomdp sweep run GRID --out runs --dry-run`.
 
 
 def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = None) -> Path:
-    """Write the report of all runs in `sources` to `out`; returns the page.
-
-    Args:
-        sources: run folders, results folders, or folders that contain some.
-        out: output folder.
-        samples: renders sample observations, which needs OpenGL; None leaves them out.
-    """
+    """Write the report of all runs in `sources` (run folders, results folders, or folders that contain some) to `out`;
+    returns the page. Without `samples`, which need OpenGL, no sample observations are drawn."""
     refuse_foreign(out, "navigation report", RUNS)
     found = find_navigation(sources, out)
     runs, unfinished = load_runs(found), [result for result in found if not result.finished]
@@ -372,7 +370,7 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
         save_runs(runs, out)
         state, folder = refitted_error("state"), out / "figures"
         folder.mkdir(exist_ok=True)
-        shown = {
+        written = {
             "accuracy.png": figures.accuracy_bars(runs, state, folder / "accuracy.png"),
             "accuracy_raw.png": figures.accuracy_bars(runs, state.raw(), folder / "accuracy_raw.png"),
             "trajectories.png": figures.trajectories(runs, folder / "trajectories.png"),
@@ -384,12 +382,12 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
         columns = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
         filled.assign(**numbers)[columns].to_csv(out / "tables.csv", index=False, lineterminator="\n")
         lines = [*_head(runs, unfinished), *verdict_lines(runs)]
-        for name in filter(shown.get, shown):
+        for name in filter(written.get, written):
             lines += [f"![{_CAPTIONS[name][0]}](figures/{name})", "", _CAPTIONS[name][1], ""]
         lines += [*table_sections(cells), _COMMANDS]
         commands = [(run, run.result.files["results"]["command"], run.result.files["timing"]) for run in runs]
-        told = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
-        lines += code_block(told, "bash")
+        shell = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
+        lines += code_block(shell, "bash")
         write_text(out / "report.md", "\n".join(lines) + "\n")
     return out / "report.md"
 
@@ -430,8 +428,8 @@ def _head(runs: list[NavigationRun], unfinished: list[Result]) -> list[str]:
                 unlike.append(f"Not alike in {code(maze)}: {name} is {found[0]}, but {'; '.join(where)}.  ")
     lines += [*unlike, ""] if unlike else []
     lines += [_HARD] if any(MAZES[run.condition.maze].style is HARD for run in runs) else []
-    told = {run.condition.maze: run.result.record["config"]["exogenous"] for run in runs if run.condition.exogenous}
-    images = [f"{markdown(name)} in {code(maze)}" for maze, name in told.items()]
+    sources = {run.condition.maze: run.result.record["config"]["exogenous"] for run in runs if run.condition.exogenous}
+    images = [f"{markdown(name)} in {code(maze)}" for maze, name in sources.items()]
     lines += [f"Exogenous noise adds {', '.join(images)}.", ""] if images else []
     for result in unfinished:
         of = result.record["config"].get("steps", "?")

@@ -60,7 +60,7 @@ class Condition(NamedTuple):
     def short(self) -> str:
         """Name without the maze."""
         words = {"sp": self.self_prediction, "exo": self.exogenous, "literal": self.literal_future}
-        return "-".join([self.method, f"K{self.max_k}", *(word for word, told in words.items() if told)])
+        return "-".join([self.method, f"K{self.max_k}", *(word for word, is_on in words.items() if is_on)])
 
 
 class Measure(NamedTuple):
@@ -180,7 +180,7 @@ def read_trajectory(path: Path) -> pd.DataFrame:
         table = pd.read_csv(io.BytesIO(read_bytes(path)), dtype=str).astype(float)  # as Python parses them
         if table[["x", "y", "estimated_x", "estimated_y"]].empty:
             raise ValueError("it has no rows")
-        return table
+    return table
 
 
 def find_navigation(sources: Sequence[Path], but: Path | None = None) -> list[Result]:
@@ -236,8 +236,8 @@ def _read_run(result: Result) -> NavigationRun:
         settings = settings_of(config) | {"steps": int(timing["steps"]), "set": results["set"]}
         settings |= {name: value for name, value in result.record.get("inputs", {}).items() if name == "exogenous"}
         left_out = {"method", "max_k", "literal_future", "preset", "steps" * (condition.method == UNTRAINED)}
-        shown = {name: str(value) for name, value in settings.items() if name not in left_out}
-        run = NavigationRun(result, condition, config["preset"], config["seed"], shown, values)
+        settings = {name: str(value) for name, value in settings.items() if name not in left_out}
+        run = NavigationRun(result, condition, config["preset"], config["seed"], settings, values)
         _ = float(timing["seconds"]), results["command"]  # for the report
     for measure, value in values.items():
         if not math.isfinite(value):

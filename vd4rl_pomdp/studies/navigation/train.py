@@ -113,9 +113,11 @@ class MazeData:
         """Prepare the observations and move everything to a device."""
         if self._config.picture != "rgb100":  # shrunk once, so that training never touches the large images
             shrink = {"grey50": to_grey50, "rgb50": to_rgb50}[self._config.picture]
-            blocks = torch.arange(self.dataset.num_rows).split(1000)
-            self.dataset.frames = torch.cat([shrink(self.view.observe(rows)) for rows in blocks])
-            self.view = View(self.dataset, frame_stack=1)
+            channels, size = SHAPES[self._config.picture]
+            small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
+            for rows in torch.arange(self.dataset.num_rows).split(1000):
+                small[rows] = shrink(self.view.observe(rows))
+            self.dataset.frames, self.view = small, View(self.dataset, frame_stack=1)
         self.dataset.to(device)
         for name in ("states", "hidden", "mean", "std"):
             setattr(self, name, getattr(self, name).to(device))
@@ -309,7 +311,8 @@ def train(config: NavigationConfig) -> RunFolder:
             probe, rows = measure(probed, run.path / METRICS_FILE)
             write_trajectory(run.path / TRAJECTORY_FILE, probed, probe)
             card = EncoderCard(
-                **labels,
+                method=config.method,
+                task=data.maze.name,
                 quality=data.maze.driver,
                 corruption=flat(CorruptionConfig()),
                 seed=config.seed,

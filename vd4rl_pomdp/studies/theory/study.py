@@ -378,8 +378,8 @@ def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]
                 "complete": f"{row['forced']} of {row['pairs']} pairs of states are always told apart",
                 "discards": "the past's code must carry part of the exogenous state",
             }
-            told = PRINTED[row["method"].removesuffix(" literal")]  # literal readings share it
-            failed = [column for column in computed if told[column] and not row[column]]
+            printed = PRINTED[row["method"].removesuffix(" literal")]  # literal readings share it
+            failed = [column for column in computed if printed[column] and not row[column]]
             found += [(world, row["method"], column, computed[column]) for column in failed]
     for row in (row for row in equations if row["fails_k"] and row["decodes"]):
         text = f"{FORMS[row['form']]} for {row['where']}"
