@@ -11,9 +11,9 @@ import tyro
 
 from finetune.algorithms import ALGORITHMS
 from finetune.histories import HistoryOptions
-from vd4rl_pomdp.core.errors import MAX_SEED, refuse_outside
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig, flat
-from vd4rl_pomdp.core.tasks import FRAME_SIZES, MOST_EPISODES
+from vd4rl_pomdp.core.tasks import FRAME_SIZES, MOST_EPISODES, TASKS
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 
@@ -133,7 +133,7 @@ class FinetuneConfig(StageConfig):
         )  # fmt: skip
 
 
-def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, decisions: int) -> FinetuneConfig:
+def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, task: str) -> FinetuneConfig:
     """Settings that training actually uses, after the encoder has overridden or disabled some of them.
 
     Args:
@@ -141,8 +141,15 @@ def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, decision
         algorithm: algorithm that the encoder's method dictates (end-to-end methods such as bc); empty if the encoder is
             frozen.
         remembers: whether the encoder has memory.
-        decisions: decisions in one episode of the task; the default `eval_length` is raised to it.
+        task: its name; the default `eval_length` is raised to the decisions in one of its episodes.
+
+    Raises:
+        UserError: the task is unknown, but its episodes are to be played.
     """
+    try:
+        decisions = TASKS.named(task).decisions if config.eval_episodes else 0
+    except UserError as error:
+        raise UserError(f"{error}; `--eval-episodes 0` trains a policy without playing it") from error
     if config.eval_length == FinetuneConfig.eval_length:
         config = replace(config, eval_length=max(config.eval_length, decisions))
     if algorithm:

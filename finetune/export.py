@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from finetune.evaluation import Episode, episode_rows, evaluate, jobs_of, own_and_none
-from vd4rl_pomdp.agents import CARD, checksums, find_agent, write_rounded
+from vd4rl_pomdp.agents import CARD, FILES, checksums, find_agent, write_rounded
 from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.tasks import MOST_EPISODES, TASKS
@@ -43,25 +44,35 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
         raise UserError(f"{run}: is not a finished fine-tuning run; name a folder that `vd4rl-pomdp finetune` wrote")
     encoder, config = read_record(run / "encoder"), told.record["config"]
     about = encoder.pretrain
-    write_rounded(run, out)
     length = min(config["eval_length"], TASKS.named(about.task).decisions)
     under = own_and_none(CorruptionConfig.fill(about.corruption))
-    card = {name: told.labels[name] for name in LABELS} | {
-        "data": told.record["inputs"]["data"],
-        "corruption": about.corruption,
-        "budget": {
-            "pretraining": {"preset": about.preset, "steps": about.steps, "frames": encoder.frames, "seed": about.seed},
-            "finetuning": {"preset": config["preset"], "updates": told.files["timing"].get("updates")},
-        },
-        "run": told.id,
-        "commit": told.commit,
-        "length": length,
-        "episodes": _played(out, told.labels, length, under, episodes, workers),
-        "render": render_info(about.task),
-        "processor": machine("cpu")["processor"],
-        "sha256": checksums(out),
-    }
-    write_json(out / CARD, card)
+    try:
+        write_rounded(run, out)
+        card = {name: told.labels[name] for name in LABELS} | {
+            "data": told.record["inputs"]["data"],
+            "corruption": about.corruption,
+            "budget": {
+                "pretraining": {
+                    "preset": about.preset,
+                    "steps": about.steps,
+                    "frames": encoder.frames,
+                    "seed": about.seed,
+                },
+                "finetuning": {"preset": config["preset"], "updates": told.files["timing"].get("updates")},
+            },
+            "run": told.id,
+            "commit": told.commit,
+            "length": length,
+            "episodes": _played(out, told.labels, length, under, episodes, workers),
+            "render": render_info(about.task),
+            "processor": machine("cpu")["processor"],
+            "sha256": checksums(out),
+        }
+        write_json(out / CARD, card)
+    except BaseException:  # a signal, too: the same command must find the folder empty
+        for part in {name.partition("/")[0] for name in FILES}:
+            shutil.rmtree(out / part, ignore_errors=True)
+        raise
     return card
 
 

@@ -22,7 +22,7 @@ from finetune.trainer import RESULTS, FinetuneTrainer, make_trainer
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_outside
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.registry import warn_of_other_code
-from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
+from vd4rl_pomdp.core.tasks import UNKNOWN_QUALITY
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder, read_record
@@ -76,7 +76,7 @@ class _Asked:
         self.encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
         refuse_outside(config, shift=(0, dataset.frame_size - 1))
         remembers = self.encoder.memory is not None
-        self.config = config = as_trained(config, card.end_to_end, remembers, _decisions(config, card.task))
+        self.config = config = as_trained(config, card.end_to_end, remembers, card.task)
         if isinstance(config.memory, HistoryOptions):
             self.encoder.config = replace(self.encoder.config, **config.memory.encoder_changes)
         if self.encoder.reads_state:
@@ -95,14 +95,6 @@ class _Asked:
         warn_of_other_code(self.config.encoder, vars(self.before), self.before.parts, what)
         self.dataset.to(self.device)
         return make_trainer(self.config, self.dataset, self.encoder.to(self.device), self.card, self.run)
-
-
-def _decisions(config: FinetuneConfig, task: str) -> int:
-    """Decisions in an evaluation episode; UserError for an unknown task if there are any."""
-    try:
-        return TASKS.named(task).decisions if config.eval_episodes else 0
-    except UserError as error:
-        raise UserError(f"{error}; `--eval-episodes 0` trains a policy without playing it") from error
 
 
 ALIKE = (

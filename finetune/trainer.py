@@ -83,7 +83,9 @@ def make_trainer(
     write_json(run.path / LABELS_FILE, labels_of(config, card))
     if not all((run.path / name).exists() for name in FILES_OF_RUN):
         # copied, with the pretraining's timing, so that the run can be moved and evaluated anywhere
-        if (timing := config.encoder.parent / TIMING_FILE).exists():
+        before = config.encoder.parent  # a pretraining run, or a fine-tuning run on its encoder
+        timing = before / (PRETRAIN_TIMING_FILE if (before / LABELS_FILE).exists() else TIMING_FILE)
+        if timing.exists():
             write_json(run.path / PRETRAIN_TIMING_FILE, read_json(timing))
         changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
         copy_encoder(config.encoder, run.path / "encoder", changes)

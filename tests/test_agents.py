@@ -25,9 +25,20 @@ from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import read_run
 
 
-def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop(data, encoder, tmp_path, capsys):
+def interrupted(*arguments):
+    raise KeyboardInterrupt
+
+
+def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop(
+    data, encoder, tmp_path, capsys, monkeypatch
+):
     run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=6)).path
     out = tmp_path / "agents" / "mine"
+    with monkeypatch.context() as patch:
+        patch.setattr("finetune.export.evaluate", interrupted)
+        with pytest.raises(SystemExit):
+            main(["agents", "export", str(run), "--out", str(out)])
+    assert "re-run the same command" in capsys.readouterr().err
     main(["agents", "export", str(run), "--out", str(out), "--episodes", "2", "--workers", "1"])
     assert f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")' in capsys.readouterr().out
     agent = load_agent(str(out))

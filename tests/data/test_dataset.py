@@ -261,6 +261,11 @@ def test_every_trap_of_the_published_files_at_once(tmp_path):
     np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t, 21) for e, t in starts]))
 
 
+def test_the_folder_within_the_tasks_is_the_quality_whatever_lies_above(tmp_path):
+    folder = write_fake_set(tmp_path / "expert" / "walker_walk" / "humanA")
+    assert open_dataset(folder, tmp_path / "cache").quality == "humanA"
+
+
 def test_a_link_tells_a_set_as_the_folder_that_it_names_would(tmp_path):
     held = write_fake_set(tmp_path / "held" / "medium", physics_dim=18)
     (tmp_path / "walker_walk").mkdir()

@@ -1,6 +1,7 @@
 """Sets of other libraries in and out: what those libraries write is read, what is written they read."""
 
 import os
+import shutil
 from pathlib import Path
 
 import gymnasium
@@ -22,7 +23,8 @@ from vd4rl_pomdp.data.transfer import export_set, import_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.nn.policy import policy_step
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.sweeps.plan import DataSet
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.plan import DataSet, plan_jobs
 
 LENGTHS = [20, 25, 9]
 KEYS = [
@@ -175,6 +177,13 @@ def test_what_is_no_set_of_pictures_is_refused(minari, layout, message, tmp_path
     with pytest.raises(UserError, match=message):
         import_set("minari", "test/screen-v0", tmp_path / "set")
     assert not (tmp_path / "set").exists()
+
+
+def test_a_set_of_one_camera_is_not_taken_for_that_of_another(minari, tmp_path):
+    record(minari, Screen(lambda frame: {"left": frame, "right": 255 - frame}), jpeg_encoding=False)
+    import_set("minari", "test/screen-v0", tmp_path / "set", picture="left")
+    with pytest.raises(UserError, match="holds a dataset that differs in source; choose another --out"):
+        import_set("minari", "test/screen-v0", tmp_path / "set", picture="right")
 
 
 def test_minari_out_and_in_loses_nothing(minari, tmp_path):
@@ -456,6 +465,12 @@ def test_a_set_without_a_task_trains_and_is_not_evaluated(tmp_path, own_cache):
     assert run.finished
     assert read_episodes(out / "episodes.csv") == []
     assert policy_step(out / "policy") == 40
+    shutil.move(folder, tmp_path / "sets" / "own" / "x")
+    text = 'preset = "smoke"\ncollect = {task = "own", quality = "x"}\npretrain = {method = "mik+a", corruption = '
+    (tmp_path / "g.toml").write_text(text + '"patch+zero_frames"}\nfinetune = {eval_episodes = 0}\n')
+    cells = load_grid(str(tmp_path / "g.toml")).cells()
+    jobs, _ = plan_jobs(cells, tmp_path, tmp_path / "sets")
+    assert [job.finished for job in jobs] == [True] * 3, "a grid finds both runs"
 
 
 def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):

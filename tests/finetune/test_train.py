@@ -267,6 +267,14 @@ def test_the_clean_evaluation_may_have_another_number_of_episodes_and_is_made_up
     assert find_results([run])[0].id == find_results([whole])[0].id
 
 
+def test_the_cost_of_the_pretraining_comes_along_with_a_copied_encoder(encoder, data, tmp_path):
+    few = {"updates": 2, "batch_size": 4, "eval_episodes": 0}
+    first = run_finetune(smoke_finetune(encoder, data, tmp_path / "first", **few)).path
+    again = run_finetune(smoke_finetune(first / "encoder", data, tmp_path / "again", **few)).path
+    told = [json.loads(path.read_text()) for path in (encoder.parent / "timing.json", again / "pretrain_timing.json")]
+    assert told[0] == told[1]
+
+
 def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
     changes = {"updates": 2, "batch_size": 4, "eval_length": 2, "eval_clean": False}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **changes))

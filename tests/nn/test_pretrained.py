@@ -97,6 +97,60 @@ def test_the_command_line_trains_what_stands_behind_it_and_a_folder_says_which_w
     load_encoder(folder)
 
 
+SHAPE = {
+    "hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16, "image_size": SIZE,
+    "patch_size": 14,
+}  # fmt: skip
+
+
+def test_features_never_come_from_weights_that_the_file_lacks(tmp_path: Path):
+    transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
+    transformers.ViTForImageClassification(transformers.ViTConfig(**SHAPE)).save_pretrained(tmp_path / "vit")
+    transformers.IJepaModel(transformers.IJepaConfig(**SHAPE)).save_pretrained(tmp_path / "ijepa")
+    for name, read in (("vit", lambda tokens: tokens[:, 0]), ("ijepa", lambda tokens: tokens.mean(1))):
+        # transformers would make up a pooling layer for the first, anew in every load; the second has no class token
+        first, again = (make("pretrained", model=str(tmp_path / name), model_size=SIZE).frame for _ in range(2))
+        assert first.found == again.found
+        part = first.convolutions
+        image = torch.rand(1, 9, SIZE, SIZE) - 0.5
+        frames = (image.view(3, 3, SIZE, SIZE) + 0.5 - part.mean) / part.std
+        expected = read(transformers.AutoModel.from_pretrained(tmp_path / name)(frames).last_hidden_state)
+        torch.testing.assert_close(part(image).view(3, 16), expected)
+    model = transformers.Dinov2Model.from_pretrained
+    lacking = transformers.Dinov2Model(transformers.Dinov2Config(**SHAPE))
+    del lacking.layernorm.bias
+    lacking.save_pretrained(tmp_path / "lacking")
+    assert model(tmp_path / "lacking") is not None, "transformers loads it"
+    with pytest.raises(UserError, match=r"its file lacks 1 weights, such as layernorm\.bias: fetch it again"):
+        make("pretrained", model=str(tmp_path / "lacking"), model_size=SIZE)
+
+
+def test_a_model_with_text_gives_its_vision_half_under_its_own_statistics(tmp_path: Path):
+    transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
+    text = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+    config = transformers.CLIPConfig(text_config=text | {"vocab_size": 49408}, vision_config=SHAPE)
+    transformers.CLIPModel(config).save_pretrained(tmp_path / "clip")
+    plain = make("pretrained", model=str(tmp_path / "clip"), model_size=SIZE).frame
+    told = {"image_mean": [0.1, 0.2, 0.3], "image_std": 0.5}
+    (tmp_path / "clip" / "preprocessor_config.json").write_text(json.dumps(told))
+    frame = make("pretrained", model=str(tmp_path / "clip"), model_size=SIZE).frame
+    assert frame.found != plain.found, "other statistics are another model"
+    image = torch.rand(1, 3, SIZE, SIZE)
+    vision = transformers.CLIPVisionModel.from_pretrained(tmp_path / "clip")
+    expected = vision((image - torch.tensor(told["image_mean"])[:, None, None]) / 0.5).pooler_output
+    torch.testing.assert_close(frame.convolutions(image.repeat(1, 3, 1, 1) - 0.5).view(3, 16), expected.expand(3, 16))
+
+
+def test_random_features_and_other_sizes_are_refused(tmp_path: Path):
+    transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
+    transformers.ViTMAEModel(transformers.ViTMAEConfig(**SHAPE)).save_pretrained(tmp_path / "mae")
+    with pytest.raises(UserError, match="its features of one image differ from call to call"):
+        make("pretrained", model=str(tmp_path / "mae"), model_size=SIZE)
+    transformers.ViTModel(transformers.ViTConfig(**SHAPE)).save_pretrained(tmp_path / "vit")
+    with pytest.raises(UserError, match=r"cannot encode images of 56x56 pixels \(Input image size .* --model-size"):
+        make("pretrained", model=str(tmp_path / "vit"), model_size=56)
+
+
 def test_an_absent_library_is_one_line(monkeypatch, tmp_path, capsys):
     data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
     monkeypatch.setitem(sys.modules, "transformers", None)

@@ -220,6 +220,8 @@ def test_methods_of_an_undecided_setting_are_listed_by_name(tmp_path):
     report = write_report([runs], tmp_path / "out")
     assert ("walker_walk", "expert", "patch", "td3_bc") in unranked(report.gates)
     assert methods(report.summary) == ["acro", "mik+a", "random", "state", "supervised+a"]
+    for name in ("representations", "control"):
+        assert methods(pd.read_csv(tmp_path / "out" / f"{name}.csv")) == methods(report.summary)
     text = report.page.read_text()
     assert text.index("undecided at this budget: state returns") < text.index("Final scores")
     ranked = write_report([grid(tmp_path / "good", GOOD)], tmp_path / "other")

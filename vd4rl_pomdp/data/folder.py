@@ -159,8 +159,9 @@ def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str 
 
     Any folder name directly within a task's folder is accepted as a quality.
     """
-    task, quality = _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
-    return task, quality or (path.name if path.parent.name in TASKS else None)
+    whole = Path(os.path.abspath(path))
+    qualities = (whole.name,) if whole.parent.name in TASKS else SET_QUALITIES
+    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", qualities)
 
 
 def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:

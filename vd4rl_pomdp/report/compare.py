@@ -59,9 +59,7 @@ def _loaded(path: Path) -> tuple[Row, Conditions]:
     runs = [run for run in load_runs([path]) if run.stage == "finetune"]
     finished = [run for run in runs if run.evaluated]
     if not finished:
-        raise UserError(
-            f"{path}: holds no finished and evaluated run to compare; name one that does; name one that does"
-        )
+        raise UserError(f"{path}: holds no finished and evaluated run to compare; name one that does")
     counts = {"finished": len(finished), "others": len(runs) - len(finished)}
     return {"path": path, **counts, "made": made_with(finished)}, groups(finished, lambda run: run.of(CONDITION))
 

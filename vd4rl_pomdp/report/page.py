@@ -294,7 +294,8 @@ def _tables(runs: list[Run], choice: Choice, memory: dict[tuple, str]) -> tuple[
     gaps = pd.DataFrame(load.find_gaps(runs, choice), columns=[*load.CONDITION, "seed", "state"])
     judged = [row | {"memory": memory[tuple(row[name] for name in SETTING)]} for row in gates(runs)]
     claimed = judge_claims(runs, unranked(judged))
-    summary = tables.summary(final, gaps, unranked(judged, SETTING))
+    undecided = unranked(judged, SETTING)
+    summary = tables.summary(final, gaps, undecided)
     places = summary[list(SETTING)].itertuples(index=False, name=None)
     summary["memory"] = [memory.get(place, NOT_CERTIFIED) for place in places]
     every = tables.all_runs(load.runs_frame(runs), gaps)
@@ -306,9 +307,9 @@ def _tables(runs: list[Run], choice: Choice, memory: dict[tuple, str]) -> tuple[
         "curves": tables.curves(evaluated),
         "aggregate": tables.aggregate(final, gaps),
         "runs": every,
-        "representations": tables.representations(every),
+        "representations": tables.representations(every, undecided),
         "costs": tables.costs(every),
-        "control": tables.control(every),
+        "control": tables.control(every, undecided),
         "elsewhere": tables.elsewhere(finished),
         "critics": tables.critics(every),
         "improvement": tables.improvement(final),

@@ -58,10 +58,15 @@ def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tu
     columns = [*CONDITION, "step", "score", "low", "high", "seeds", "episodes", "few_seeds"]
     columns += ["best_step", "best_score", "best_low", "best_high", "absent", "missing"]
     table = pd.DataFrame(found, columns=columns)
+    return _ranked(table, "score", unranked)
+
+
+def _ranked(table: pd.DataFrame, by: str, unranked: Collection[tuple[str, ...]]) -> pd.DataFrame:
+    """Sort by setting, then by a column, highest first, or by name where the setting is `unranked`."""
     places = table[list(SETTING)].itertuples(index=False, name=None)
     # If a gate fails, sorting by score would suggest a ranking of methods.
     by_name = pd.Series([place in unranked for place in places], table.index, dtype=bool)
-    return _ordered(table, -table["score"].astype(float).mask(by_name, 0.0), labels(table))
+    return _ordered(table, -table[by].astype(float).mask(by_name, 0.0), labels(table))
 
 
 def _scores(rows: pd.DataFrame) -> Row:
@@ -189,10 +194,10 @@ def all_runs(runs: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
     return _ordered(table, -table["score"].astype(float))
 
 
-def representations(table: pd.DataFrame) -> pd.DataFrame:
+def representations(table: pd.DataFrame, unranked: Collection[tuple[str, ...]] = ()) -> pd.DataFrame:
     """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and its gaps.
 
-    A mean is missing if any seed lacks the value.
+    A mean is missing if any seed lacks the value. Sorted as in `summary`.
     """
     means = _means(table[table["score"].notna()], ["action_loss", *load.PROBES, "return", *COSTS])
     gaps = [
@@ -200,7 +205,7 @@ def representations(table: pd.DataFrame) -> pd.DataFrame:
         for condition, seeds in table.groupby(list(CONDITION), sort=False)
     ]
     found = pd.DataFrame(gaps, columns=[*CONDITION, "missing"]).merge(means, how="left", on=list(CONDITION))
-    return _ordered(found.fillna({"seeds": 0}), -found["return"])
+    return _ranked(found.fillna({"seeds": 0}), "return", unranked)
 
 
 def _means(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
@@ -220,15 +225,15 @@ def costs(table: pd.DataFrame) -> pd.DataFrame:
     return grouped.agg(runs=("seed", "size"), **spans, machines=machines).reset_index()
 
 
-def control(table: pd.DataFrame) -> pd.DataFrame:
+def control(table: pd.DataFrame, unranked: Collection[tuple[str, ...]] = ()) -> pd.DataFrame:
     """Control performance of every condition and of its data: means over the finished seeds.
 
     Return, fraction of episodes above 80% of the data's return, and closed-loop action error are from the last
-    evaluation: as trained, and under no corruption (`clean_`).
+    evaluation: as trained, and under no corruption (`clean_`). Sorted as in `summary`.
     """
     names = ["data_return", *load.CONTROL, *(f"clean_{name}" for name in load.CONTROL), "path_error"]
     found = _means(table[table["score"].notna()], names)
-    return _ordered(found, -found["return"])
+    return _ranked(found, "return", unranked)
 
 
 def elsewhere(episodes: pd.DataFrame) -> pd.DataFrame:

@@ -159,6 +159,8 @@ class RunFolder:
             write_json(path, hardware)
         else:
             told, began = read_json(path), read_json(self.path / CONFIG_FILE)
+            if began["config"] != (config := began["config"] | self.config):  # of flags that may change
+                write_json(self.path / CONFIG_FILE, began | {"config": config})
             later = told.pop(CONTINUED, [])
             code = {name: began.get(name, {}) for name in now}  # versions, commit, and origin of plug-ins
             if (told | code | (later[-1] if later else {})) != hardware | now:

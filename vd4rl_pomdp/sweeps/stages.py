@@ -13,7 +13,7 @@ from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.core.options import flat, settings_of, words_of
 from vd4rl_pomdp.core.parsing import parse, parse_stage
-from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
+from vd4rl_pomdp.core.tasks import SET_QUALITIES
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
@@ -115,5 +115,5 @@ def recorded(cell: GridCell, section: str) -> Values:
         before = config_of(cell, "pretrain")
         method = METHODS.named(before.method)
         remembers = history_of(before.method, method, before.history) != "none"
-        config = as_trained(config, method.end_to_end, remembers, TASKS.named(cell.value("task")).decisions)
+        config = as_trained(config, method.end_to_end, remembers, cell.value("task"))
     return jsonable(flat(config))

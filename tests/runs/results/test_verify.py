@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from finetune.train import finetune
-from tests.helpers_stages import smoke_finetune
+from tests.helpers_stages import CutError, cut_at, smoke_finetune
 from tests.runs.results.test_results import COMMITTED, whole_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -128,6 +128,18 @@ def test_what_was_edited_by_hand_is_found(data, encoder, tmp_path):
         told = changed(results, edit)
         assert [one for one in told if said in one], (place, told)
         (results / "runs.jsonl").write_text(whole[results / "runs.jsonl"])
+
+
+def test_what_may_change_is_recorded_as_it_was_when_the_run_ended(data, encoder, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        cut_at(patch, 2)
+        with pytest.raises(CutError):
+            finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4))
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4, eval_clean=False, log_every=5)).path
+    add_results([run], tmp_path / "results")
+    (told,) = read_results(tmp_path / "results")
+    assert (told.record["config"]["eval_clean"], told.record["config"]["log_every"]) == (False, 5)
+    assert verify_results(tmp_path / "results")[1] == []
 
 
 def test_an_episode_is_replayed_to_the_digit_and_a_difference_names_what_drew_and_computed(

@@ -79,7 +79,7 @@ def read(source: str, picture: str | None) -> SourceSet:
         sum(lengths) + len(lengths),
         size,
         lambda first: map(episode, range(first, len(lengths))),
-        {"id": dataset.id, "steps": sum(lengths), "minari": dataset.minari_version},
+        {"id": dataset.id, "picture": key, "steps": sum(lengths), "minari": dataset.minari_version},
         actions.low.ravel() if bounded else None,
         actions.high.ravel() if bounded else None,
         told.get("task") or _task(spec),
