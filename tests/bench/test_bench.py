@@ -48,16 +48,16 @@ def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
 
 
 def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
-    small, named = partial(suite.synthetic_set, episodes=1), ("sampling", "pretraining", "finetuning", "methods")
-    unmeasured = ("against_jax", "stacking", "memories", "memory", "collection", "sharing")
-    for name in (*unmeasured, "maze_pictures", "maze_training"):
+    small = partial(suite.synthetic_set, episodes=1)
+    named = ("sampling", "pretraining", "finetuning", "methods", "memories")
+    for name in ("against_jax", "stacking", "memory", "collection", "sharing", "maze_pictures", "maze_training"):
         monkeypatch.setattr(suite, name, lambda *_: {})
     for name in named:
         monkeypatch.setattr(suite, name, lambda dataset, *_: {"device": dataset.t.device.type})
     monkeypatch.setattr(suite, "synthetic_set", lambda folder, _: small(folder))
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
     results = suite.bench()
-    assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 3]
+    assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 4]
 
 
 def test_policies_are_measured_against_jax(tmp_path, monkeypatch):

@@ -124,8 +124,8 @@ def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
         add("stacked", lambda: stacked(dataset, features, size))
         add("drq_bc", lambda: measured(partial(end_to_end, dataset, size), device, size.steps, size.blocks))
         for method in ("mik+a", "acro"):
-            trainer = partial(make_trainer, dataset, pretraining(folder, method, size))
-            add(method, partial(measured, lambda made=trainer: made().update, device, size.steps, size.blocks))
+            train = partial(next_step, dataset, pretraining(folder, method, size))
+            add(method, partial(measured, train, device, size.steps, size.blocks))
         add("encoders_at_once", lambda: encoders_at_once(dataset, folder, size))
         add("evaluation", lambda: evaluation(encoder, dataset, folder, size))
     return results | {"machine": machine(device_name), "commit": git_commit(), "versions": versions()}
@@ -181,6 +181,11 @@ def pretraining(folder: Path, method: str, size: Size) -> PretrainConfig:
         frame_encoder=size.frame_encoder, batch_size=size.windows, window=size.window,
         max_k=min(15, size.window - 1),
     )  # fmt: skip
+
+
+def next_step(dataset: Dataset, config: PretrainConfig) -> Callable[[], Any]:
+    """A function that makes one pretraining step."""
+    return make_trainer(dataset, config).update
 
 
 def encoding(dataset: Dataset, encoder: Encoder, folder: Path, size: Size) -> dict[str, float]:

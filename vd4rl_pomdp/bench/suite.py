@@ -269,7 +269,7 @@ def maze_pictures(frames: int) -> dict[str, float]:
     from vd4rl_pomdp.envs.maze import MazeEnv, gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE}
+    size: dict[str, Any] = {"width": PICTURE_SIZE, "height": PICTURE_SIZE}
     default: Any = gymnasium.make("PointMaze_UMaze-v3", render_mode="rgb_array", **size)
     default.reset(seed=0)
     usual = rate(default.render, frames)

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -89,7 +89,7 @@ def make_tables(runs: Sequence[NavigationRun]) -> pd.DataFrame:
     for table, view, row, condition, measure in _layout(runs):
         values = list(numbers.get((condition, measure), {}).values())
         low, high = (mean_interval(np.array(values)[:, None]) if values else None) or (None, None)
-        cell = {"table": table, "view": view, "row": row, "maze": condition.maze}
+        cell: dict[str, Any] = {"table": table, "view": view, "row": row, "maze": condition.maze}
         cell |= {"mean": np.mean(values) if values else None, "low": low, "high": high, "seeds": len(values)}
         cell |= {"of_seeds": seeds[condition.maze], "paper": paper_number(condition, measure)}
         rows.append(cell | {"missing": is_missing(condition, trained)})

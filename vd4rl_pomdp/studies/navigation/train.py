@@ -322,7 +322,7 @@ def train(config: NavigationConfig) -> RunFolder:
                 settings=settings_of(run.config),
             )
             save_encoder(run.path / "encoder", probed.encoder, card, frames)
-            record = {"maze": data.maze.name, "set": data.dataset.fingerprint}
+            record: dict[str, Any] = {"maze": data.maze.name, "set": data.dataset.fingerprint}
             record |= {"command": shlex.join(command_of(config)), "rows": rows}
             write_json(run.path / NAVIGATION_FILE, record)
             seconds = {"seconds": round(trained, 2), "total_seconds": round(run.seconds, 2)}
