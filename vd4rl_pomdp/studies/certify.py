@@ -177,7 +177,8 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
     verdict = NEEDS if known and all(low > 0 for _, low, _ in above.values()) else OPEN
     if known and any(high < MARGIN * unit for *_, high in above.values()):
         verdict = OPEN if weak else NEEDS_NOT
-    why = [f"{MEMORY} {with_interval(*methods[MEMORY], digits=digits)}"]
-    why += [f"less {floor} {with_interval(*difference, digits=digits)}" for floor, difference in above.items()]
+    mean, low, high = methods[MEMORY]
+    why = [f"{MEMORY} {with_interval(mean, low, high, digits)}"]
+    why += [f"less {floor} {with_interval(mean, low, high, digits)}" for floor, (mean, low, high) in above.items()]
     why += ["too few seeds"] * (not known) + ["too little itself to tell"] * (weak and verdict == OPEN)
     return {"methods": methods, "above": above, "verdict": verdict, "why": ", ".join(why)}
