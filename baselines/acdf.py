@@ -64,5 +64,4 @@ class ACDF(LatentForward):
         return now.detach() + gate * (now - now.detach()), following
 
     def after_step(self) -> None:
-        """Count the update."""
         self.updates += 1

@@ -52,7 +52,6 @@ class CURL(Objective):
         self.draws = Draws(seed, "curl", "shift")
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """InfoNCE over all real rows of the batch."""
         query = self.encoder.encode(self._shifted(window))
         with torch.no_grad():
             positive = self.momentum_encoder.encode(self._shifted(window))
@@ -65,7 +64,6 @@ class CURL(Objective):
         return loss, {"loss": loss.detach(), "accuracy": share_found(scores, *counted)}
 
     def after_step(self) -> None:
-        """Update the momentum encoder."""
         move_target(self.momentum_encoder, self.encoder, MOMENTUM)
 
     def _shifted(self, window: Windows) -> Windows:

@@ -86,7 +86,6 @@ class FinetuneConfig(StageConfig):
 
     @property
     def seed_of_views(self) -> int:
-        """Seed from which the views are drawn."""
         return self.seed if self.view_seed is None else self.view_seed
 
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
@@ -117,14 +116,12 @@ class FinetuneConfig(StageConfig):
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of the algorithm and of the encoder's memory."""
         return {
             "options": ALGORITHMS.named(values["algorithm"]).options.fill(values),
             "memory": HistoryOptions.fill(values),
         }
 
     def check(self) -> None:
-        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
@@ -138,8 +135,7 @@ def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, task: st
 
     Args:
         config: the settings as given.
-        algorithm: algorithm that the encoder's method dictates (end-to-end methods such as bc); empty if the encoder is
-            frozen.
+        algorithm: of an end-to-end method, such as bc; empty if the encoder is frozen.
         remembers: whether the encoder has memory.
         task: its name; the default `eval_length` is raised to the decisions in one of its episodes.
 
@@ -153,7 +149,6 @@ def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, task: st
     if config.eval_length == FinetuneConfig.eval_length:
         config = replace(config, eval_length=max(config.eval_length, decisions))
     if algorithm:
-        told = config.defaults(config.preset) | flat(config)
-        options = ALGORITHMS.named(algorithm).options.fill(told)
+        options = ALGORITHMS.named(algorithm).options.fill(config.defaults(config.preset) | flat(config))
         config = replace(config, algorithm=algorithm, options=options, views=0)
     return config if remembers and not algorithm else replace(config, memory=NO_OPTIONS)

@@ -36,7 +36,6 @@ class EndToEnd:
         self.optimiser = Adam(encoder.parameters(), config.learning_rate)
 
     def update(self, batch: Transitions) -> dict[str, Tensor]:
-        """One update of encoder, critic and actor; returns detached scalars."""
         device = batch.obs.device
         with autocast(device, self.config.precision):
             z = self.encoder.frame(batch.obs).float()
@@ -46,10 +45,8 @@ class EndToEnd:
         return self.algorithm.update(features, self.optimiser)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume."""
         return {name: getattr(self, name).state_dict() for name in ("algorithm", "encoder", "optimiser")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from `state_dict`."""
         for name, own in state.items():
             getattr(self, name).load_state_dict(own)

@@ -101,12 +101,8 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
     ]
 
 
-@cache
-def _environment(*place: Any) -> CorruptedEnv:
-    """Cached environment of this process, so that all episodes share one GL context."""
-    return CorruptedEnv(*place)
-
-
+_environment = cache(CorruptedEnv)
+"""Cached, so that all episodes of this process share one GL context."""
 _read_actor = cache(read_actor)
 
 
@@ -149,12 +145,8 @@ def _run_episode(job: EpisodeJob) -> Episode:
 def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | None]]:
     """Mean reward and action error by time within the episode, to see where policies fail.
 
-    Args:
-        episodes: of one task; one that ended early counts in the parts that it reached.
-        parts: number of equal parts of the longest episode, at least 1; capped at its number of decisions.
-
-    Returns:
-        By first and last decision ("0-49"): mean `reward` and `action_error` (None if unknown) per decision.
+    The longest episode is cut into at most `parts` equal parts; one that ended early counts in those that it reached.
+    By first and last decision ("0-49"): mean `reward` and `action_error` (None if unknown) per decision.
     """
     longest = max(len(episode.rewards) for episode in episodes)
     parts = min(parts, longest)
@@ -196,15 +188,9 @@ def jobs_of(
 
 
 def another(trained: dict[str, Any], corruption: str, options: dict[str, Any]) -> tuple[CorruptionConfig, str]:
-    """Another corruption to evaluate under, and its label in rows.
+    """The corruption of a name and options; missing ones are as in training, or else the defaults.
 
-    Args:
-        trained: settings of the policy's training corruption.
-        corruption: name of the other one.
-        options: its options by name; missing ones are as in training, or else the defaults.
-
-    Returns:
-        The corruption, and its name with the options that differ from training: "patch, patch_size 24".
+    Also its label in rows: the name with the options that differ from training, "patch, patch_size 24".
     """
     own = CorruptionConfig.fill(trained | {"corruption": corruption})
     before = flat(own)
@@ -229,16 +215,14 @@ def refuse_kept(run: Path, evaluated_under: str) -> None:
 def evaluate_run(
     run: Path, corruption: str | None, episodes: int, workers: int, **options: Any
 ) -> tuple[list[dict[str, Any]], list[Episode]]:
-    """Evaluate a fine-tuning run's policy again.
+    """Evaluate a fine-tuning run's policy again, in episodes as long as in its own evaluations.
 
     Args:
         run: its folder.
-        corruption: name of the corruption to evaluate under, with the run's options where they apply. None: both the
-            run's own corruption and no corruption.
-        episodes: episodes per corruption, as long as in the run's own evaluations.
+        corruption: name of the corruption to evaluate under, see `another`. None: the run's own, and none.
+        episodes: episodes per corruption.
         workers: processes; 0: one per core.
-        options: overrides of that corruption's options; the rows' `evaluated_under` names those that differ from the
-            run's.
+        options: that corruption's options.
 
     Returns:
         Rows of `episodes.csv` (`corruption` is that of training, `step` that of the policy), and their episodes.
@@ -254,16 +238,15 @@ def evaluate_run(
     (encoder, card), record = load_encoder(run / "encoder"), read_json(run / CONFIG_FILE)
     what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
     warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
-    under, told = own_and_none(CorruptionConfig.fill(card.corruption)), ""
+    under, label = own_and_none(CorruptionConfig.fill(card.corruption)), ""
     if corruption is not None:
-        one, told = another(card.corruption, corruption, options)
+        one, label = another(card.corruption, corruption, options)
         under = [one]
     for one in under:
         check_corruption_fits(one, FRAME_SIZE if encoder.reads_state else encoder.config.size)
     labels = {name: evaluated[0][name] for name in LABELS} | {"step": policy_step(run / "policy")}
     length = record["config"]["eval_length"]
-    jobs = jobs_of(run, TASKS.named(card.task), under, episodes, length, evaluated_under=told)
-    played = evaluate(jobs, workers)
+    played = evaluate(jobs_of(run, TASKS.named(card.task), under, episodes, length, evaluated_under=label), workers)
     return episode_rows(played, labels), played
 
 
@@ -272,11 +255,7 @@ REPLAYED = ("return", "length", "score", "action_error")
 
 
 def replay(run: Path, results: Iterable[Result]) -> tuple[Row, Row, str]:
-    """Replay the first episode of a run's last evaluation.
-
-    Args:
-        run: the run's folder, with encoder and policy.
-        results: results among which the run's row is looked up by id.
+    """Replay the first episode of a run's last evaluation, whose row is in the results under the run's id.
 
     Returns:
         The recorded row, the replayed row, and a text on the renderers and processors behind both.
@@ -285,17 +264,17 @@ def replay(run: Path, results: Iterable[Result]) -> tuple[Row, Row, str]:
         UserError: as in `evaluate_run`, or the results lack this run or its policy's last evaluation.
     """
     own, step = read_run(run), policy_step(run / "policy")
-    told = next((result for result in results if result.id == own.id), None)
-    if told is None:
+    result = next((result for result in results if result.id == own.id), None)
+    if result is None:
         raise UserError(f"{run}: run {own.id} has no rows in the results folder; name a run that has")
-    of_policy = [row for row in told.rows if row["step"] == step and row["evaluated_under"] == row["corruption"]]
-    recorded = next((row for row in of_policy if row["episode"] == 0), None)
+    firsts = [row for row in result.rows if row["step"] == step and row["episode"] == 0]
+    recorded = next((row for row in firsts if row["evaluated_under"] == row["corruption"]), None)
     if recorded is None:
         raise UserError(
             f"{run}: its policy is from update {step}, for which the results lack run {own.id}'s first episode"
         )
     (replayed,), _ = evaluate_run(run, recorded["corruption"], 1, 1)
-    made = told.files.get("render", {}), told.parts[-1].get("processor")
+    made = result.files.get("render", {}), result.parts[-1].get("processor")
     row, here = (
         f"mujoco {render.get('mujoco')}, {render.get('gl_renderer')}, {processor}"
         for render, processor in (made, (render_info(recorded["task"]), machine("cpu")["processor"]))

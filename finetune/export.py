@@ -25,31 +25,25 @@ KEPT = ("episode", "episode_seed", "return", "length", "score", "evaluated_under
 def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> Row:
     """Round a run's encoder and policy to float16, evaluate them, and write both and a card as an agent's folder.
 
-    Args:
-        run: folder of a finished fine-tuning.
-        out: folder to create; may exist if empty.
-        episodes: evaluation episodes, each under the training corruption and under none.
-        workers: processes; 0: one per core.
-
-    Raises:
-        UserError: `run` is no finished fine-tuning or is damaged, or `out` is not empty.
+    As many episodes are under the training corruption as under none. UserError if the run is no finished fine-tuning or
+    is damaged, or `out` is not empty.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
     refuse_inside(out)
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another --out")
-    told = read_run(run)
-    if told.record["stage"] != "finetune" or not told.finished or told.diverged:
+    trained = read_run(run)
+    if trained.record["stage"] != "finetune" or not trained.finished or trained.diverged:
         raise UserError(f"{run}: is not a finished fine-tuning run; name a folder that `vd4rl-pomdp finetune` wrote")
-    encoder, config = read_record(run / "encoder"), told.record["config"]
+    encoder, config = read_record(run / "encoder"), trained.record["config"]
     about = encoder.pretrain
     length = min(config["eval_length"], TASKS.named(about.task).decisions)
     under = own_and_none(CorruptionConfig.fill(about.corruption))
     try:
         write_rounded(run, out)
-        card = {name: told.labels[name] for name in LABELS} | {
-            "data": told.record["inputs"]["data"],
+        card = {name: trained.labels[name] for name in LABELS} | {
+            "data": trained.record["inputs"]["data"],
             "corruption": about.corruption,
             "budget": {
                 "pretraining": {
@@ -58,12 +52,12 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
                     "frames": encoder.frames,
                     "seed": about.seed,
                 },
-                "finetuning": {"preset": config["preset"], "updates": told.files["timing"].get("updates")},
+                "finetuning": {"preset": config["preset"], "updates": trained.files["timing"].get("updates")},
             },
-            "run": told.id,
-            "commit": told.commit,
+            "run": trained.id,
+            "commit": trained.commit,
             "length": length,
-            "episodes": _played(out, told.labels, length, under, episodes, workers),
+            "episodes": _played(out, trained.labels, length, under, episodes, workers),
             "render": render_info(about.task),
             "processor": machine("cpu")["processor"],
             "sha256": checksums(out),
@@ -85,16 +79,8 @@ def replay_agent(folder: Path) -> Row:
 def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple[list[Row], list[list[Episode]]]:
     """Play the same episodes with several agents, under the first one's corruption. First episodes are filmed.
 
-    Args:
-        names: shipped agents, or folders.
-        episodes: episodes per agent.
-        workers: processes; 0: one per core.
-
-    Returns:
-        The agents' cards, and their episodes.
-
-    Raises:
-        UserError: no agent is named, one is unknown or damaged, or their tasks differ.
+    Returns the cards of the agents (shipped ones, or folders) and each one's episodes. UserError if none is named, one
+    is unknown or damaged, or their tasks differ.
     """
     if not names:
         raise UserError("no agents given: name a shipped agent or a folder")

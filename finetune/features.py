@@ -41,18 +41,12 @@ STAGE = "finetune"
 class FeatureBatch(Batch):
     """n-step transitions of representations (see `Transitions` for reward and discount)."""
 
-    z: Tensor
-    """(B, D)."""
-    action: Tensor
-    """(B, A)."""
-    reward: Tensor
-    """(B,)."""
-    discount: Tensor
-    """(B,)."""
-    next_z: Tensor
-    """(B, D)."""
-    next_action: Tensor
-    """(B, A): the dataset's action at next_z; zero at an episode's last row, which has none."""
+    z: Tensor  # (B, D)
+    action: Tensor  # (B, A)
+    reward: Tensor  # (B,)
+    discount: Tensor  # (B,)
+    next_z: Tensor  # (B, D)
+    next_action: Tensor  # (B, A), the dataset's action at next_z; zero at an episode's last row, which has none
 
 
 class FrozenEncoder:
@@ -126,14 +120,14 @@ _ENCODED: WeakValueDictionary[tuple[str, str, int], Tensor] = WeakValueDictionar
 """Features still in use by a training in this process, by everything that determines them."""
 
 
-def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path, encoder: str) -> Tensor:
+def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, cached: Path, encoder: str) -> Tensor:
     """Encode the whole dataset under `views` draws, or reuse the features from this process or from this run's file.
 
     Args:
         frozen: the encoder and its dataset.
         histories: which features there are.
         views: number of draws of corruption and shift.
-        kept: file that keeps the features for resuming; the run itself checks that dataset and encoder are unchanged.
+        cached: file of the features for resuming; the run itself checks that dataset and encoder are unchanged.
         encoder: hash of the encoder's weights (`encoder_hash`).
 
     Returns:
@@ -143,28 +137,23 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
     """
     key = frozen.name(encoder), histories.name(), views
     if (features := _ENCODED.get(key)) is None:
-        if kept.exists():
-            with disk_errors(kept):
-                features = torch.from_numpy(np.load(kept)).to(frozen.device)
+        if cached.exists():
+            with disk_errors(cached):
+                features = torch.from_numpy(np.load(cached)).to(frozen.device)
         else:
-            features = _encode(frozen, histories, views)
-            with replacing_file(kept) as fresh, fresh.open("wb") as file:
+            dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
+            features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
+            total = views * frozen.dataset.num_episodes
+            # on a GPU, no_grad avoids compiling, which takes longer than the encoding
+            with torch.no_grad(), ProgressLine("encode", total, "episodes") as progress:
+                for number in range(views):
+                    view, random = frozen.view(number), histories.of_view(number)
+                    for episodes in frozen.groups():
+                        random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
+                        progress.advance(len(episodes))
+            with replacing_file(cached) as fresh, fresh.open("wb") as file:
                 np.save(file, features.cpu().numpy())
         _ENCODED[key] = features
-    return features
-
-
-def _encode(frozen: FrozenEncoder, histories: Histories, views: int) -> Tensor:
-    dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
-    features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
-    total = views * frozen.dataset.num_episodes
-    # on a GPU, no_grad avoids compiling, which takes longer than the encoding
-    with torch.no_grad(), ProgressLine("encode", total, "episodes") as progress:
-        for number in range(views):
-            view, random = frozen.view(number), histories.of_view(number)
-            for episodes in frozen.groups():
-                random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
-                progress.advance(len(episodes))
     return features
 
 
@@ -179,7 +168,7 @@ class FeatureSampler:
         dataset, rows = histories.dataset, histories.rows
         reward, discount, _ = dataset.n_step_returns(rows, n_step, gamma)
         actions = dataset.action_after(rows), dataset.action_or_zero(histories.ends)
-        self.told = torch.cat([*actions, reward[:, None], discount[:, None]], dim=1)
+        self.data = torch.cat([*actions, reward[:, None], discount[:, None]], dim=1)
         """(M, 2 A + 2): actions at both ends, reward and discount of every transition, in one tensor to save GPU kernel
         launches."""
         # the critics' targets can use cached z' because the encoder never changes
@@ -188,20 +177,17 @@ class FeatureSampler:
         """(2, views, M) int64: index of both ends of every transition in each view, with views concatenated."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume with the same batches."""
         return {"batches": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from `state_dict`."""
         self.draws.set_state(state["batches"])
 
     def sample(self) -> FeatureBatch:
-        """The next batch."""
-        count = len(self.told)
+        count = len(self.data)
         index = self.draws.integers(count, self.batch_size)
         view = self.draws.integers(len(self.features), self.batch_size)
         ends = self.ends.flatten(1)[:, torch.add(index, view, alpha=count)]
-        return _batch(_rows(self.features.flatten(0, 1), ends), _rows(self.told, index))
+        return _batch(_rows(self.features.flatten(0, 1), ends), _rows(self.data, index))
 
 
 class StackedSampler:
@@ -211,25 +197,25 @@ class StackedSampler:
         """Start from copies of the runs' samplers, which must agree in views and batch size."""
         self._features = [sampler.features.flatten(0, 1) for sampler in samplers]
         self._shared = all(sampler.features is samplers[0].features for sampler in samplers)
-        self._counts, self._views = [len(sampler.told) for sampler in samplers], len(samplers[0].features)
+        self._counts, self._views = [len(sampler.data) for sampler in samplers], len(samplers[0].features)
         self._shape = len(samplers), samplers[0].batch_size
         self.draws = stacked([sampler.draws for sampler in samplers])
-        self._told = torch.cat([sampler.told for sampler in samplers])
+        self._data = torch.cat([sampler.data for sampler in samplers])
         self._ends = torch.cat([sampler.ends for sampler in samplers], dim=2).flatten(1)
         first = [sum(self._counts[:number]) for number in range(len(samplers))]
-        self._first = torch.tensor(first, device=self._told.device)[:, None]
+        self._first = torch.tensor(first, device=self._data.device)[:, None]
 
     def sample(self) -> FeatureBatch:
         """The next batch of every run: tensors of (S, B, ...)."""
         index = self.draws.integers(self._counts, *self._shape) + self._first
         view = self.draws.integers(self._views, *self._shape)
-        ends = self._ends[:, torch.add(index, view, alpha=len(self._told))]
+        ends = self._ends[:, torch.add(index, view, alpha=len(self._data))]
         if self._shared:
             both = _rows(self._features[0], ends)
         else:
             pairs = zip(self._features, ends.unbind(1), strict=True)
             both = torch.stack([_rows(own, end) for own, end in pairs], dim=1)
-        return _batch(both, _rows(self._told, index))
+        return _batch(both, _rows(self._data, index))
 
 
 def _rows(values: Tensor, numbers: Tensor) -> Tensor:
@@ -237,11 +223,11 @@ def _rows(values: Tensor, numbers: Tensor) -> Tensor:
     return values.index_select(0, numbers.flatten()).view(*numbers.shape, -1)
 
 
-def _batch(both: Tensor, told: Tensor) -> FeatureBatch:
+def _batch(both: Tensor, data: Tensor) -> FeatureBatch:
     """Build a batch from (2, ..., D) features of both ends and (..., 2 A + 2) actions, rewards and discounts."""
     z, next_z = both.float()
-    action, next_action = told[..., :-2].chunk(2, dim=-1)
-    return FeatureBatch(z, action, told[..., -2], told[..., -1], next_z, next_action)
+    action, next_action = data[..., :-2].chunk(2, dim=-1)
+    return FeatureBatch(z, action, data[..., -2], data[..., -1], next_z, next_action)
 
 
 class ExactSampler(Sampler):

@@ -46,7 +46,6 @@ class HistoryOptions(Options):
     }
 
     def check(self) -> None:
-        """Raise UserError for invalid values."""
         super().check()
         if self.shortest_history > self.longest_history:
             raise UserError(
@@ -69,14 +68,7 @@ class Histories:
     """
 
     def __init__(self, dataset: Dataset, options: Options, n_step: int, seed: int) -> None:
-        """See the class.
-
-        Args:
-            dataset: the dataset.
-            options: `HistoryOptions`; any other options mean full histories.
-            n_step: rows between both ends of a transition; fewer at an episode's end.
-            seed: the run's seed.
-        """
+        """Options other than `HistoryOptions` mean full histories."""
         self.dataset, self._n_step, self._seed = dataset, n_step, seed
         self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
         self.rows = dataset.transition_rows
@@ -93,7 +85,6 @@ class Histories:
         return content_hash([asdict(self._options), self._n_step, self._seed]) if self.random else ""
 
     def of_view(self, view: int) -> RandomHistories:
-        """Draw the random histories of a view."""
         generator = stream_generator(self._seed, "finetune", "histories", view)
         chosen = torch.randperm(len(self.rows), generator=generator)[: self.random].sort().values
         shortest, longest = self._options.shortest_history, self._options.longest_history
@@ -119,14 +110,7 @@ class RandomHistories:
         return first, last
 
     def fill(self, out: Tensor, encoder: Encoder, frames: Tensor, episodes: range) -> None:
-        """Write the features of consecutive episodes into a view's.
-
-        Args:
-            out: (features, D), numbered as in `Histories`.
-            encoder: must have memory if any history is random.
-            frames: (rows, F) frame features of the episodes' rows.
-            episodes: their numbers.
-        """
+        """Write the features of consecutive episodes into a view's, (features, D), from (rows, F) frame features."""
         dataset = self.histories.dataset
         whole = dataset.rows_of(episodes)
         out[whole] = read_whole(encoder, frames, dataset, episodes)
@@ -158,11 +142,7 @@ def read_both_ends(
 ) -> tuple[Tensor, Tensor]:
     """Representations (B, D) and (B, D) of rows `row` and `last`, with histories that begin at rows `first`.
 
-    Args:
-        encoder: must have memory.
-        frames: frame features (B, T, F) of (B, T) int64 rows.
-        dataset: the dataset.
-        first, row, last: (B,) int64, each triple from one episode, first <= row <= last.
+    All are (B,) int64, each triple from one episode; `frames` gives the frame features (B, T, F) of (B, T) rows.
     """
     span = torch.arange(int((last - first).max()) + 1, device=row.device)
     # pad shorter histories with their last row; a causal memory cannot look ahead to the padding

@@ -58,7 +58,6 @@ class Stack:
         whole.each = self._each  # type: ignore[method-assign]
 
     def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
-        """One update of every run, on a batch of (S, B, ...) tensors; returns (S,) logs."""
         return self.whole.update(batch)
 
     def settle(self, number: int) -> None:
@@ -71,7 +70,6 @@ class Stack:
                 _slice_optimiser(part, own[number], number)
 
     def _each(self, function: Callable[..., Result], batch: FeatureBatch, *tensors: Tensor) -> Result:
-        """Apply a function to each run's batch under each run's weights."""
 
         def one(own: dict[str, Tensor], fields: dict[str, Tensor], *more: Tensor) -> Any:
             return functional_call(self._modules, own, (function, FeatureBatch(**fields), *more))

@@ -44,26 +44,25 @@ def finetune_all(
 ) -> list[RunFolder]:
     """Run or resume the stage for several runs, with shared updates (see `finetune.stack`).
 
-    Args:
-        configs: one per run; may differ in seeds, encoder, data and evaluation settings.
-        words: command-line words of each run, for its record.
+    They may differ in seeds, encoder, data and evaluation; `words` are each run's command line, for its record.
 
     Raises:
         UserError: invalid settings, or runs that cannot be stacked.
         FloatingPointError: a run diverged; the others were trained to the end.
     """
     datasets: dict[Path, Dataset] = {}
-    asked = [_Asked(config, datasets, own) for config, own in zip(configs, words or [None] * len(configs), strict=True)]
-    if len(asked) > 1:
-        _refuse_unlike(asked)
+    commands = words or [None] * len(configs)
+    prepared = [_Prepared(config, datasets, own) for config, own in zip(configs, commands, strict=True)]
+    if len(prepared) > 1:
+        _refuse_unlike(prepared)
     with ExitStack() as owned:
-        for one in asked:
+        for one in prepared:
             owned.enter_context(one.run)
-        train([one.trainer() for one in asked if not one.run.finished])
-    return [one.run for one in asked]
+        train([one.trainer() for one in prepared if not one.run.finished])
+    return [one.run for one in prepared]
 
 
-class _Asked:
+class _Prepared:
     """A requested run and its inputs."""
 
     def __init__(self, config: FinetuneConfig, datasets: dict[Path, Dataset], words: Sequence[str] | None) -> None:
@@ -104,10 +103,10 @@ ALIKE = (
 """Settings that all runs of a stack must share, besides the algorithm's options."""
 
 
-def _refuse_unlike(asked: Sequence[_Asked]) -> None:
+def _refuse_unlike(prepared: Sequence[_Prepared]) -> None:
     """Raise UserError for runs that cannot be stacked, naming two of them and the difference."""
-    first = asked[0]
-    for number, one in enumerate(asked):
+    first = prepared[0]
+    for number, one in enumerate(prepared):
         if one.card.end_to_end:
             raise UserError(
                 f"{one.config.out}: {one.card.method} also trains its encoder and cannot be stacked; train it by itself"
@@ -116,7 +115,7 @@ def _refuse_unlike(asked: Sequence[_Asked]) -> None:
             raise UserError(
                 f"{one.config.out}: --views 0 encodes every batch and cannot be stacked; train it by itself"
             )
-        if any(one.config.out.resolve() == other.config.out.resolve() for other in asked[:number]):
+        if any(one.config.out.resolve() == other.config.out.resolve() for other in prepared[:number]):
             raise UserError(f"--out {one.config.out} is given twice: a folder holds one run")
         for (what, value), (_, other) in zip(_alike(first), _alike(one), strict=False):
             if value != other:
@@ -126,10 +125,10 @@ def _refuse_unlike(asked: Sequence[_Asked]) -> None:
                 )
 
 
-def _alike(asked: _Asked) -> list[tuple[str, Any]]:
+def _alike(prepared: _Prepared) -> list[tuple[str, Any]]:
     """What runs of a stack must share, as (description, value). The algorithm comes first: it decides the options."""
-    settings = {name: getattr(asked.config, name) for name in ALIKE} | flat(asked.config.options)
-    widths = [("the representations' width", asked.encoder.dim), ("the actions' width", asked.dataset.action_dim)]
+    settings = {name: getattr(prepared.config, name) for name in ALIKE} | flat(prepared.config.options)
+    widths = [("the representations' width", prepared.encoder.dim), ("the actions' width", prepared.dataset.action_dim)]
     return [(flag_of(name), value) for name, value in settings.items()] + widths
 
 
@@ -142,7 +141,6 @@ class Updates:
     """Updates of one run or a stack, replayed as CUDA graphs on a GPU."""
 
     def __init__(self, trainers: Sequence[FinetuneTrainer]) -> None:
-        """Start from the trainers' current state."""
         first = trainers[0].algorithm
         self._algorithm: Algorithm | EndToEnd = first
         self._sampler: Any = trainers[0].sampler

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -30,7 +30,7 @@ from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
-from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, save_encoder, tell_probe
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, record_probe, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import Actor, read_actor
@@ -73,12 +73,7 @@ def make_trainer(
 ) -> FinetuneTrainer:
     """Build a run's trainer, with batches from cached features, from features encoded on the fly, or from pixels.
 
-    Args:
-        config: settings of the run.
-        dataset: its dataset, on the device.
-        encoder: on the device too.
-        card: the encoder's metadata, with the dataset's quality.
-        run: its folder, which must be owned; labels, encoder and features are written there.
+    Labels, encoder and features are written into the run's folder, which must be owned.
     """
     write_json(run.path / LABELS_FILE, labels_of(config, card))
     if not all((run.path / name).exists() for name in FILES_OF_RUN):
@@ -127,16 +122,9 @@ def path_error(
     encode: Callable[[int], torch.Tensor],
     policy: Callable[[torch.Tensor], torch.Tensor],
 ) -> float:
-    """Difference between a policy and the data's behaviour policy, on the data's own states.
+    """Mean squared difference between a policy and the behaviour policy's mean action, on the data's own states.
 
-    Args:
-        dataset: a dataset with simulator states.
-        actor: the behaviour policy.
-        encode: episode number -> representations (rows, D).
-        policy: (rows, D) -> actions (rows, A).
-
-    Returns:
-        Mean squared difference to the actor's mean action over all decisions of at most PATH_EPISODES episodes.
+    Over all decisions of at most PATH_EPISODES episodes. `encode` gives an episode's representations (rows, D).
     """
     assert dataset.task is not None
     assert dataset.physics is not None
@@ -147,9 +135,9 @@ def path_error(
     errors = []
     for number in deciding[np.unique(np.linspace(0, last, min(last + 1, PATH_EPISODES)).astype(int))].tolist():
         physics = dataset.physics[dataset.rows_of(number)][:-1]  # no decision at an episode's last row
-        shown = np.array([actor.act(state) for state in observed_states(task, physics)])
+        behaviour = np.array([actor.act(state) for state in observed_states(task, physics)])
         actions = policy(encode(number)[:-1]).cpu().numpy()
-        errors.append(np.square(actions - shown.reshape(actions.shape)).mean(1))
+        errors.append(np.square(actions - behaviour.reshape(actions.shape)).mean(1))
     return float(np.concatenate(errors).mean())
 
 
@@ -159,36 +147,30 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.num_episodes < 2 or dataset.task is None or dataset.task not in TASKS:
         return
     if (run.path / PROBE_FILE).exists():
-        tell_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
+        record_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
     errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))
-    tell_probe(run.path / "encoder", errors)
+    record_probe(run.path / "encoder", errors)
     write_json(run.path / PROBE_FILE, errors)
 
 
+@dataclass(eq=False)
 class FinetuneTrainer:
     """One run: an algorithm, its batches, and where the results go."""
 
-    loop: Loop
+    algorithm: Algorithm | EndToEnd
+    sampler: FeatureSampler | ExactSampler | TransitionSampler
+    config: FinetuneConfig
+    card: EncoderCard
+    folder: RunFolder
+    reference: Reference
+    path_error: Callable[[Policy], float] | None
+    step: int = 0
+    settle: Callable[[], None] = lambda: None
+    """Brings algorithm and sampler up to date when a stack makes the updates."""
+    loop: Loop = field(init=False)
     """Set while training."""
-
-    def __init__(
-        self,
-        algorithm: Algorithm | EndToEnd,
-        sampler: FeatureSampler | ExactSampler | TransitionSampler,
-        config: FinetuneConfig,
-        card: EncoderCard,
-        run: RunFolder,
-        reference: Reference,
-        path_error: Callable[[Policy], float] | None,
-    ) -> None:
-        self.algorithm, self.sampler = algorithm, sampler
-        self.config, self.card, self.folder = config, card, run
-        self.reference, self.path_error = reference, path_error
-        self.step = 0
-        self.settle: Callable[[], None] = lambda: None
-        """Brings algorithm and sampler up to date when a stack makes the updates."""
 
     def begin(self, title: str) -> AbstractContextManager[Loop]:
         """Open the training loop, resuming from the newest checkpoint. No progress is shown without a title."""
@@ -203,7 +185,6 @@ class FinetuneTrainer:
             self.evaluate()
 
     def finish(self) -> None:
-        """Write the final files of a trained run."""
         path = self.folder.path
         if self.path_error:
             self.reference.with_path_error(self.path_error(self.algorithm.policy)).write(path)
@@ -267,13 +248,11 @@ class FinetuneTrainer:
         return rows
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to resume bit-identically."""
         self.settle()
         parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
         return {"step": self.step} | parts
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resume from `state`."""
         self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])

@@ -21,12 +21,7 @@ from vd4rl_pomdp.nn.objective import ActionOptions, Objective
 
 
 def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | None:
-    """Build the action target; None if the method predicts no actions.
-
-    Args:
-        config: the run's settings.
-        actions: (N, A) float32 training actions.
-    """
+    """Build the action target from the (N, A) float32 training actions; None if the method predicts no actions."""
     options = config.options
     if not isinstance(options, ActionOptions):
         return None
@@ -50,35 +45,31 @@ def build_objective(
         states: scale of the simulator states; needed if states are an input or a regression target.
         observation: channels and image size of pixel observations, such as (9, 84).
     """
-    method, memory = METHODS.named(config.method), {}
-    if method.reads_state or config.frame_encoder == STATE:
+    method, memory, options = METHODS.named(config.method), {}, config.options
+    shape: dict[str, Any]
+    if method.reads_state or config.frame_encoder == STATE:  # raw, with noise, or standardised with hidden coordinates
         assert states is not None
-        shape = _state_shape(config, states)
+        frame: dict[str, Any] = {}
+        if isinstance(options, StateOptions) and (options.pose_noise or options.velocity_noise):
+            frame = {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
+        if isinstance(config.frame, HiddenOptions):
+            share = config.frame.hidden_share
+            frame = {"mean": states.mean.tolist(), "std": states.std.tolist(), "hidden_share": share}
+        shape = {"frame_encoder": STATE, "channels": len(states.std), "size": 1, "frame_options": frame}
     else:
         channels, size = observation
         shape = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}
         shape |= encoder_settings(config.frame)
     if isinstance(config.memory, MemoryOptions):
-        told = asdict(config.memory)
-        hidden, m = told.pop("hidden_dim"), told.pop("m")
+        others = asdict(config.memory)
+        hidden, m = others.pop("hidden_dim"), others.pop("m")
         past = method.past if m is None else m
         memory = {
             "history": history_of(config.method, method, getattr(config, "history", "method")),
             "use_actions": method.use_actions,
             "hidden_dim": hidden,
             "history_window": 0 if past is None else past + 1,  # the m rows of the past, and row t itself
-            "memory_options": told,
+            "memory_options": others,
         }
     encoder = Encoder(EncoderConfig(action_dim, **shape, **memory))
-    return method.build(encoder, states if method.regresses_state else target, config.options, config.seed)
-
-
-def _state_shape(config: TrainingConfig, states: StateScale) -> dict[str, Any]:
-    """`EncoderConfig` fields for state input: raw, with noise added, or standardised with coordinates hidden."""
-    options = config.options
-    told: dict[str, Any] = {}
-    if isinstance(options, StateOptions) and (options.pose_noise or options.velocity_noise):
-        told = {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
-    if isinstance(config.frame, HiddenOptions):
-        told = {"mean": states.mean.tolist(), "std": states.std.tolist(), "hidden_share": config.frame.hidden_share}
-    return {"frame_encoder": STATE, "channels": len(states.std), "size": 1, "frame_options": told}
+    return method.build(encoder, states if method.regresses_state else target, options, config.seed)

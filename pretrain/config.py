@@ -76,7 +76,6 @@ class TrainingConfig(StageConfig):
     choosers: ClassVar[tuple[str, ...]] = ("method", "frame_encoder", "action_target")
 
     def check(self) -> None:
-        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, log_every=1, checkpoint_every=1
@@ -121,7 +120,6 @@ class PretrainConfig(TrainingConfig):
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Fill the options of method, memory, frame encoder and corruption from flag values."""
         method = METHODS.named(values["method"])
         return {
             "options": method.options.fill(values),
@@ -131,13 +129,12 @@ class PretrainConfig(TrainingConfig):
         }
 
     def check(self) -> None:
-        """Raise UserError for invalid settings, before anything is read or written."""
         super().check()
         method = METHODS.named(self.method)
         refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
         if self.batch_size < method.least_batch:
-            told = f"{self.method} tells windows apart: give it {method.least_batch}"
-            raise UserError(f"--batch-size is {self.batch_size}; {told}")
+            why = f"{self.method} tells windows apart: give it {method.least_batch}"
+            raise UserError(f"--batch-size is {self.batch_size}; {why}")
         if self.frame_encoder == STATE and not (isinstance(self.options, ActionOptions) or self.method == "random"):
             raise UserError(f"--frame-encoder state is for random and methods that predict actions, not {self.method}")
 

@@ -74,8 +74,8 @@ def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
     check_corruption_fits(config.corruption, FRAME_SIZE if method.reads_state else dataset.frame_size)
     seed_networks(config.seed, STAGE)
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
-    told = method.reads_state or method.regresses_state or config.frame_encoder == STATE
-    states = dataset.state_scale() if told else None
+    needed = method.reads_state or method.regresses_state or config.frame_encoder == STATE
+    states = dataset.state_scale() if needed else None
     return build_objective(config, dataset.action_dim, target, states, (3 * FRAME_STACK, dataset.frame_size))
 
 
@@ -87,9 +87,10 @@ def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective)
         view: View = StateView(dataset, frame.observe, config.corruption, config.seed, STAGE)
     else:
         view = view_of(dataset, config)
-    given = view, config.batch_size, config.window, draws
-    told = method.histories, getattr(config.options, "hold_out", False)
-    return StateWindowSampler(*given, *told) if method.regresses_state else WindowSampler(*given)
+    if not method.regresses_state:
+        return WindowSampler(view, config.batch_size, config.window, draws)
+    hold_out = getattr(config.options, "hold_out", False)
+    return StateWindowSampler(view, config.batch_size, config.window, draws, method.histories, hold_out)
 
 
 class StateWindowSampler(WindowSampler):
@@ -98,16 +99,8 @@ class StateWindowSampler(WindowSampler):
     def __init__(
         self, source: View, batch_size: int, length: int, draws: RandomStream, histories: bool, hold_out: bool
     ) -> None:
-        """Initialise.
-
-        Args:
-            source: view of the data set.
-            batch_size: windows per batch.
-            length: rows per window.
-            draws: random stream of the first rows.
-            histories: sample histories up to the episode's end instead of windows; see `Method.histories`.
-            hold_out: set the states of the probe's test episodes to NaN, so that no loss sees them.
-        """
+        """`histories`: see `Method.histories`. `hold_out`: the states of the probe's test episodes are NaN, for no loss
+        to see."""
         super().__init__(source, batch_size, length, draws)
         data = source.dataset
         # a separate sampler, so that no other method can read a state by mistake
@@ -118,7 +111,6 @@ class StateWindowSampler(WindowSampler):
         self._longest = data.longest_episode if histories else 0
 
     def sample(self) -> StateWindows:
-        """Next batch."""
         window = self._histories() if self._longest else super().sample()
         return StateWindows(**window, state=self._states[self.view.dataset.rows(window.key)])
 
@@ -184,13 +176,9 @@ class Trainer:
         config: TrainingConfig,
         learning_rate: Callable[[int], float] | None = None,
     ) -> None:
-        """Set up the optimiser; no step is taken.
+        """Objective and batches are on one device already.
 
-        Args:
-            objective: the module to train, already on its device.
-            batches: sampler on the same device.
-            config: the stage's settings.
-            learning_rate: schedule from step (starting at 0) to learning rate; None: the config's, constant.
+        `learning_rate` is a schedule from step (starting at 0) to learning rate; None: the config's, constant.
         """
         self.objective, self.batches, self.config, self._learning_rate = objective, batches, config, learning_rate
         self.device = next(objective.parameters()).device
@@ -238,8 +226,8 @@ class Trainer:
         Args:
             run: folder for checkpoints and metrics.
             steps: total number of steps.
-            title: title of the progress bar.
-            labels: tags of the run for wandb and TensorBoard.
+            title: of the progress bar.
+            labels: of the run, for wandb and TensorBoard.
             measures: called for extra values in each row of metrics, next to the objective's mean scalars.
             also_at: log a row of metrics after this step, too.
         """
@@ -251,7 +239,6 @@ class Trainer:
             loop.require_finite(self.objective)  # no later loss would show that the last step diverged
 
     def state(self) -> dict[str, Any]:
-        """Everything needed for a bit-exact resume."""
         return {
             "step": self.step,
             "objective": self.objective.state_dict(),
@@ -260,7 +247,6 @@ class Trainer:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`."""
         self.step = state["step"]
         self.objective.load_state_dict(state["objective"])
         self.optimiser.load_state_dict(state["optimiser"])

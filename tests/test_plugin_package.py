@@ -174,34 +174,9 @@ def test_the_command_line_finds_an_installed_packages_parts_and_the_record_names
     rows = (out / "finetune" / "episodes.csv").read_text().splitlines()[1:]
     assert len(rows) == 6, "two evaluations of two, the last one clean, too"
     assert all(",dot," in row and ",slow_bc," in row and ",column," in row for row in rows)
+    listed = {line.split()[0]: line for line in python("-m", "vd4rl_pomdp", "list").splitlines() if line.strip()}
+    assert all(listed[name].endswith(f"[{ORIGIN}]") for name, *_ in PARTS.values())
 
 
 def file_hash(place: Path) -> str:
     return sha256((place / "site" / "their_parts.py").read_bytes()).hexdigest()[:12]
-
-
-USE = f"""
-from vd4rl_pomdp import testing
-from vd4rl_pomdp.cli import main
-
-if __name__ == "__main__":
-    for kind, (name, _, option, value) in {PARTS}.items():
-        check = getattr(testing, f"check_{{kind}}")
-        check(name, **({{}} if option is None else {{option: value}}))
-    main(["list"])
-    for stage, flags in (("pretrain", ["method", "corruption", "frame_encoder"]), ("finetune", ["algorithm"])):
-        words = [word for kind in flags for word in ("--" + kind.replace("_", "-"), {PARTS}[kind][0])]
-        try:
-            main([stage, *words, "--help"])
-        except SystemExit:
-            pass
-"""
-
-
-def test_its_parts_are_listed_their_flags_are_in_help_and_they_pass_their_checks(python, tmp_path):
-    (tmp_path / "use.py").write_text(USE)
-    lines = python(tmp_path / "use.py").splitlines()
-    for name, _, option, _ in PARTS.values():
-        (listed,) = (line for line in lines if line.split()[:1] == [name])
-        assert listed.endswith(f"[{ORIGIN}]")
-        assert option is None or any(f"--{option.replace('_', '-')}" in line for line in lines)

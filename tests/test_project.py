@@ -1,11 +1,12 @@
 """What documentation and layout promise, checked on the tracked files."""
 
 import ast
+import pydoc
 import re
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Iterable
+from dataclasses import fields
 from graphlib import TopologicalSorter
 from importlib.metadata import requires
 from pathlib import Path
@@ -15,6 +16,9 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from finetune.algorithms import ALGORITHMS
+from pretrain.objectives import METHODS
+from tests.helpers_stages import option_names
 from tests.helpers_wheel import build_wheel
 
 ROOT = Path(__file__).parents[1]
@@ -34,12 +38,8 @@ MAY_IMPORT = {
 
 def everywhere(tree: ast.AST) -> set[str]:
     """Names of the modules that a module imports, whenever it does."""
-    return _names(ast.walk(tree))
-
-
-def _names(nodes: Iterable[ast.AST]) -> set[str]:
     names = set()
-    for node in nodes:
+    for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
@@ -120,19 +120,13 @@ def test_text_files_are_utf8_whatever_the_machine_speaks():
     assert calls == []
 
 
-def test_dependencies_are_bounded_above():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = [entry for group in project["optional-dependencies"].values() for entry in group]
-    unbounded = [entry for entry in project["dependencies"] + extras if "<" not in entry]
-    assert unbounded == []
-
-
 def test_constraints_pin_every_dependency_within_its_bounds():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     pins = {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
     assert all("+" not in line and "/" not in line and line.count("==") == 1 for line in lines), "builds or hosts"
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [entry for group in project["optional-dependencies"].values() for entry in group]
+    assert [entry for entry in project["dependencies"] + extras if "<" not in entry] == [], "unbounded above"
     wanted = [Requirement(entry) for entry in project["dependencies"] + extras]
     assert [str(r) for r in wanted if pins.get(canonicalize_name(r.name), "none") not in r.specifier] == []
 
@@ -156,40 +150,30 @@ def test_the_readmes_two_commands_exist_and_ci_runs_the_test_command():
 
 
 def test_every_registered_name_is_in_the_readme():
-    from finetune.algorithms import ALGORITHMS
-    from pretrain.objectives import METHODS
-
     readme = (ROOT / "README.md").read_text()
     assert [name for name in [*METHODS, *ALGORITHMS] if f"`{name}`" not in readme] == []
 
 
-def test_every_flag_of_the_table_of_choices_exists():
-    from dataclasses import fields
-
-    from finetune.config import FinetuneConfig
-    from pretrain.config import PretrainConfig
-    from tests.helpers_stages import option_names
-
-    settings = {f.name for config in (PretrainConfig, FinetuneConfig) for f in fields(config)} | option_names()
-    flags = {name.replace("_", "-") for name in settings}
-    named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "choices.md").read_text())
-    assert len(named) > 30
-    assert set(named) - flags == set()
-
-
-def test_every_flag_of_the_navigation_page_exists():
-    from dataclasses import fields
-
-    from tests.helpers_stages import option_names
-    from vd4rl_pomdp.cli.sweeps import RunCommand
-    from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
-    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-
-    configs = (NavigationConfig, MazeCollectConfig, RunCommand)
-    flags = {name.replace("_", "-") for c in configs for name in ({f.name for f in fields(c)} | option_names())}
-    named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "navigation.md").read_text())
-    assert len(named) > 20
-    assert set(named) - flags == set()
+@pytest.mark.parametrize(
+    ("page", "configs", "least"),
+    [
+        ("choices", ("pretrain.config.PretrainConfig", "finetune.config.FinetuneConfig"), 30),
+        (
+            "navigation",
+            (
+                "vd4rl_pomdp.studies.navigation.config.NavigationConfig",
+                "vd4rl_pomdp.studies.navigation.collect.MazeCollectConfig",
+                "vd4rl_pomdp.cli.sweeps.RunCommand",
+            ),
+            20,
+        ),
+    ],
+)
+def test_every_flag_of_a_page_exists(page, configs, least):
+    settings = {field.name for name in configs for field in fields(pydoc.locate(name))} | option_names()
+    named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / f"{page}.md").read_text())
+    assert len(named) > least
+    assert set(named) - {name.replace("_", "-") for name in settings} == set()
 
 
 def test_no_machine_paths_in_tracked_files():

@@ -5,29 +5,14 @@ from __future__ import annotations
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
-from finetune.algorithms.fql import FQL, FQLOptions
-from finetune.algorithms.iql import IQL, IQLOptions
-from finetune.algorithms.rebrac import ReBRAC, ReBRACOptions
-from finetune.algorithms.td3_bc import TD3BC, TD3BCOptions
+from finetune.algorithms.fql import FQL
+from finetune.algorithms.iql import IQL
+from finetune.algorithms.rebrac import ReBRAC
+from finetune.algorithms.td3_bc import TD3BC
 from vd4rl_pomdp.core.options import refuse_options
 from vd4rl_pomdp.core.registry import Registry
 
-__all__ = [
-    "ALGORITHMS",
-    "BC",
-    "FQL",
-    "IQL",
-    "TD3BC",
-    "Algorithm",
-    "DrQv2BC",
-    "FQLOptions",
-    "IQLOptions",
-    "Loss",
-    "ReBRAC",
-    "ReBRACOptions",
-    "ReturnOptions",
-    "TD3BCOptions",
-]
+__all__ = ["ALGORITHMS", "BC", "TD3BC", "Algorithm", "Loss", "ReturnOptions"]
 
 ALGORITHMS: Registry[type[Algorithm]] = Registry(
     "algorithm",

@@ -49,17 +49,15 @@ class Algorithm(ABC):
     """
 
     options: type[Options] = Options
-    """Class of its options."""
     summary: str = ""
-    """One-line description."""
     period: int = 1
     """Number of updates after which the Python control flow repeats, e.g. 2 if every second update trains the actor."""
 
     def __init__(self, policy: Policy, options: Any, learning_rate: float, updates: int, draws: RandomStream) -> None:
-        """Subclasses add their networks and optimisers.
+        """Subclasses add their networks and optimisers, on the policy's device.
 
         Args:
-            policy: the policy to train; everything else must be on its device.
+            policy: the policy to train.
             options: an instance of the class's `options`, stored as `settings`.
             learning_rate: for all optimisers.
             updates: total number of updates, for schedules; stored as `planned`.
@@ -100,16 +98,10 @@ class Algorithm(ABC):
     def minimise(
         self, loss_function: Callable[..., Loss], batch: FeatureBatch, *tensors: Tensor, along: Sequence[Optimizer]
     ) -> dict[str, Tensor]:
-        """Compute a loss for each run's batch and tensors, and take a gradient step.
+        """Compute a loss of each run's batch and tensors, step the optimisers `along` it, and return its logs.
 
-        Args:
-            loss_function: a method of this algorithm that changes nothing and draws nothing.
-            batch: its first argument.
-            tensors: its other arguments, e.g. random numbers drawn for it.
-            along: optimisers whose parameters are updated.
-
-        Returns:
-            The loss's logs.
+        `loss_function` is a method of this algorithm that changes nothing and draws nothing; `tensors` are its other
+        arguments, such as random numbers drawn for it.
         """
         loss = self.each(loss_function, batch, *tensors)
         self.step(loss, *along)
@@ -123,11 +115,11 @@ class Algorithm(ABC):
         """Take a gradient step in full precision. Only the optimisers' parameters change."""
         for optimiser in optimisers:
             optimiser.zero_grad(set_to_none=True)
-        asked = [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
+        updated = [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
         with torch.autocast(loss.value.device.type, enabled=False):
             # `inputs` skips gradients of the critics, through which an actor's loss runs. Stacked runs share no
             # parameters, so the gradient of the sum of their losses is each run's own.
-            loss.value.backward(torch.ones_like(loss.value), inputs=asked)
+            loss.value.backward(torch.ones_like(loss.value), inputs=updated)
         for optimiser in optimisers:
             optimiser.step()
 
@@ -136,12 +128,10 @@ class Algorithm(ABC):
         return {name: part for name, part in vars(self).items() if isinstance(part, nn.Module | Optimizer)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to resume: the state of all parts, the number of updates, the noise."""
         parts = {name: part.state_dict() for name, part in self.parts().items()}
         return parts | {"updates": int(self.updates), "noise": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from `state_dict`."""
         for name, part in self.parts().items():
             part.load_state_dict(state[name])
         if isinstance(self.updates, Tensor):

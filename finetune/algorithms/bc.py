@@ -47,26 +47,22 @@ class BC(Algorithm):
         self.optimiser = Adam(policy.net.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """One step on the one loss."""
         noise = self.draws.normal(*batch.action.shape) * noise_at(self.updates, self.planned)
         logs = self.minimise(self.cloning_loss, batch, noise, along=(self.optimiser, *encoder))
         self.updates += 1
         return logs
 
     def cloning_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Mean of (a~ - a)^2."""
         chosen = with_noise(self.policy(batch.z), noise)
         loss = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"bc_loss": loss.detach()})
 
 
 def noise_at(update: int | Tensor, planned: int) -> float | Tensor:
-    """Standard deviation of the noise after some updates: decays linearly, then stays constant.
+    """Standard deviation of the noise after some of the planned updates: decays linearly, then stays constant.
 
-    Args:
-        update: updates done, see `Algorithm.updates`.
-        planned: total updates. The noise decays over half of them if that is sooner than in V-D4RL, which trains for
-            550,000: noise that is still large at the end of training leaves the policy's actions pushed outwards.
+    It decays over half of them if that is sooner than in V-D4RL, which trains for 550,000: noise that is still large at
+    the end of training leaves the policy's actions pushed outwards.
     """
     done = share_of(update, min(NOISE_UPDATES, planned / 2))
     return NOISE_START + done * (NOISE_END - NOISE_START)

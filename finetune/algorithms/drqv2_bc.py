@@ -42,7 +42,6 @@ class DrQv2BC(TD3BC):
         return self.draws.normal(*batch.action.shape) * noise_at(self.updates, self.planned)
 
     def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:
-        """Noise for the actor's own actions."""
         return (self.next_noise(batch),)
 
     def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ from torch.func import functional_call
 from torch.optim import Optimizer
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.rebrac import NormedCritics
+from finetune.algorithms.rebrac import normed_critics
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.streams import RandomStream
@@ -70,7 +70,6 @@ class Flow(nn.Module):
         self.rest = nn.Sequential(_gelu(), *deeper, ExactLinear(hidden, action_dim))
 
     def forward(self, z: Tensor, x: Tensor, t: Tensor) -> Tensor:
-        """Velocity of x at time t."""
         return self._velocity(self.state(z), x, t)
 
     def act(self, z: Tensor, noise: Tensor) -> Tensor:
@@ -113,13 +112,12 @@ class FQL(Algorithm):
         device, shape = policy.standardise.mean.device, policy.shape
         self.noise_in = NoiseIn(shape["action_dim"], shape["hidden"]).to(device)
         self.flow = Flow(**shape).to(device)
-        self.critic = NormedCritics(**shape, layers=LAYERS, kind=_gelu(), eps=1e-6).to(device)
+        self.critic = normed_critics(**shape, layers=LAYERS, activation=_gelu(), eps=1e-6).to(device)
         self.target_critic = copy.deepcopy(self.critic)
         learnt = (policy.net, self.noise_in, self.flow, self.critic)
         self.optimiser = Adam([p for module in learnt for p in module.parameters()], learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """One step of all networks on the summed loss, then one of the critics' targets."""
         shape = batch.action.shape
         next_noise, start, noise = (self.draws.normal(*shape) for _ in range(3))
         time = self.draws.uniform(*shape[:-1], 1)
@@ -131,22 +129,13 @@ class FQL(Algorithm):
     def loss(self, batch: FeatureBatch, next_noise: Tensor, start: Tensor, time: Tensor, noise: Tensor) -> Loss:
         """Sum of three losses, each of which treats the other two's networks as constants.
 
-        Args:
-            batch: transitions.
-            next_noise: (B, A), of the next actions.
-            start: (B, A), start points of the cloned flow.
-            time: (B, 1), times along the flow.
-            noise: (B, A), of the policy's actions.
+        The flow is cloned from `start` (B, A), at times (B, 1); the other noise (B, A) is that of the actions.
         """
-        critic, flow, policy = (
-            self.critic_loss(batch, next_noise),
-            self.flow_loss(batch, start, time),
-            self.policy_loss(batch, noise),
-        )
+        critic, policy = self.critic_loss(batch, next_noise), self.policy_loss(batch, noise)
+        flow = self.flow_loss(batch, start, time)
         return Loss(critic.value + flow.value + policy.value, critic.logs | flow.logs | policy.logs)
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Mean squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value = _mean(self.target_critic(next_z, self.noise_in.act(self.policy, next_z, noise)))

@@ -83,7 +83,7 @@ class IQL(Algorithm):
         super().__init__(policy, options, learning_rate, updates, draws)
         dim, action_dim, hidden = (policy.shape[name] for name in ("dim", "action_dim", "hidden"))
         device = policy.standardise.mean.device
-        self.critic = TwinCritic(dim, action_dim, hidden).to(device)
+        self.critic = TwinCritic(lambda: mlp(dim + action_dim, hidden, 1, last=ExactLinear)).to(device)
         self.target_critic = copy.deepcopy(self.critic)
         self.value = mlp(dim, hidden, 1, last=ExactLinear).to(device)
         self.gaussian = Gaussian(action_dim).to(device)
@@ -109,7 +109,6 @@ class IQL(Algorithm):
         return torch.minimum(*self.target_critic(self.policy.standardise(batch.z), batch.action))
 
     def critic_loss(self, batch: FeatureBatch) -> Loss:
-        """Squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             # V(z') instead of Q at the policy's action: no action outside the data is evaluated
@@ -136,7 +135,6 @@ class IQL(Algorithm):
 
     @property
     def policy_learning_rate(self) -> float | Tensor:
-        """Learning rate of the actor: cosine decay to 0."""
         done = share_of(self.updates, self.planned)
         cosine = torch.cos(math.pi * done) if isinstance(done, Tensor) else math.cos(math.pi * done)
         return self.learning_rate * (1 + cosine) / 2

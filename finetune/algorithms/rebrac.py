@@ -48,20 +48,18 @@ class ReBRACOptions(ReturnOptions):
     limits: ClassVar[Limits] = {"actor_bc": 0, "critic_bc": 0, "critic_layers": (1, 16)}
 
 
-class NormedCritics(TwinCritic):
-    """Two independent Q functions with LayerNorm after every hidden layer: (B, D), (B, A) -> two (B,)."""
+def normed_critics(
+    dim: int, action_dim: int, hidden: int, layers: int, activation: nn.Module, eps: float
+) -> TwinCritic:
+    """Q functions with LayerNorm after every hidden layer."""
 
-    def __init__(self, dim: int, action_dim: int, hidden: int, layers: int, kind: nn.Module, eps: float) -> None:
-        """`kind` is the activation; `eps` is LayerNorm's."""
-        nn.Module.__init__(self)  # skips TwinCritic's networks
+    def network() -> nn.Sequential:
+        modules: list[nn.Module] = []
+        for width in [dim + action_dim] + [hidden] * (layers - 1):
+            modules += [nn.Linear(width, hidden), activation, nn.LayerNorm(hidden, eps)]
+        return nn.Sequential(*modules, ExactLinear(hidden, 1))
 
-        def network() -> nn.Sequential:
-            modules: list[nn.Module] = []
-            for width in [dim + action_dim] + [hidden] * (layers - 1):
-                modules += [nn.Linear(width, hidden), kind, nn.LayerNorm(hidden, eps)]
-            return nn.Sequential(*modules, ExactLinear(hidden, 1))
-
-        self.first, self.second = network(), network()
+    return TwinCritic(network)
 
 
 class ReBRAC(TD3BC):
@@ -75,7 +73,7 @@ class ReBRAC(TD3BC):
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
         # replaces TD3+BC's critics, which are still drawn first so that seeds give the weights of the published rows
-        critic = NormedCritics(**policy.shape, layers=options.critic_layers, kind=nn.ReLU(), eps=1e-5)
+        critic = normed_critics(**policy.shape, layers=options.critic_layers, activation=nn.ReLU(), eps=1e-5)
         self.critic = critic.to(policy.standardise.mean.device)
         self.target_critic = copy.deepcopy(self.critic)
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
@@ -87,7 +85,6 @@ class ReBRAC(TD3BC):
         return value - self.settings.critic_bc * away, {"next_bc_loss": away.mean()}
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
-        """Weighted cloning minus the value, normalised by mean |Q|."""
         z = self.policy.standardise(batch.z.detach())
         chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)

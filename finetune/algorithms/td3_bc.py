@@ -11,7 +11,7 @@ Differences: states are frozen representations, standardised like the authors' s
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -42,15 +42,13 @@ class TD3BCOptions(ReturnOptions):
 
 
 class TwinCritic(nn.Module):
-    """Two independent Q functions: (B, D), (B, A) -> two (B,)."""
+    """Two independent Q functions: (B, D), (B, A) -> two (B,); each is a new network (B, D + A) -> (B, 1)."""
 
-    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
+    def __init__(self, network: Callable[[], nn.Module]) -> None:
         super().__init__()
-        self.first = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
-        self.second = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
+        self.first, self.second = network(), network()
 
     def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Both values."""
         both = torch.cat([z, action], dim=-1)
         return self.first(both)[:, 0], self.second(both)[:, 0]
 
@@ -74,9 +72,8 @@ class TD3BC(Algorithm):
         self, policy: Policy, options: ReturnOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
-        shape = policy.shape
-        device = policy.standardise.mean.device
-        self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
+        inputs, hidden = policy.shape["dim"] + policy.shape["action_dim"], policy.shape["hidden"]
+        self.critic = TwinCritic(lambda: mlp(inputs, hidden, 1, last=ExactLinear)).to(policy.standardise.mean.device)
         self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
         self.policy_optimiser = Adam(policy.net.parameters(), learning_rate, fused=True)
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
@@ -97,11 +94,9 @@ class TD3BC(Algorithm):
         return (self.draws.normal(*batch.action.shape) * TARGET_NOISE).clamp(-NOISE_CLIP, NOISE_CLIP)
 
     def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:
-        """Noise for the actor's own actions: none."""
         return ()
 
     def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Squared error of both critics to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value, logs = self._next_value(batch, next_z, self._next_action(next_z, noise))
@@ -111,7 +106,6 @@ class TD3BC(Algorithm):
         return Loss(loss.value, loss.logs | logs)
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
-        """Cloning minus the value, normalised by mean |Q|."""
         z = self.policy.standardise(batch.z.detach())  # an encoder is trained by the critics' loss only
         chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)
@@ -127,18 +121,14 @@ class TD3BC(Algorithm):
         return torch.minimum(*self.target_critic(next_z, chosen)), {}
 
     def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:
-        """Action of the target policy, smoothed by noise."""
         return (self.target_policy.from_standardised(next_z) + noise).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
-        """Value that the actor maximises."""
         return self.critic.first(torch.cat([z, action], dim=-1))
 
     def _policy_action(self, z: Tensor, *noise: Tensor) -> Tensor:
-        """Action in the actor's loss."""
         return self.policy.from_standardised(z)
 
     def move_targets(self) -> None:
-        """Move the target networks by the fraction tau."""
         move_target(self.target_critic, self.critic, self.tau)
         move_target(self.target_policy.net, self.policy.net, self.tau)

@@ -6,20 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from baselines import (
-    ACDF,
-    ACRO,
-    CURL,
-    DRIML,
-    HOMER,
-    SMWM,
-    ACDFOptions,
-    ACROOptions,
-    DRIMLOptions,
-    HOMEROptions,
-    OneStepInverse,
-    SMWMOptions,
-)
+from baselines.acdf import ACDF, ACDFOptions
+from baselines.acro import ACRO, ACROOptions
+from baselines.curl import CURL
+from baselines.driml import DRIML, DRIMLOptions
+from baselines.homer import HOMER, HOMEROptions
+from baselines.one_step_inverse import OneStepInverse
+from baselines.smwm import SMWM, SMWMOptions
 from pretrain.objectives.all_history import AllHistory
 from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
@@ -63,9 +56,7 @@ class Method:
     least_batch: int = 1
     """Smallest --batch-size; 2 for losses that contrast windows with each other."""
     options: type[Options] = Options
-    """Class of the method's options."""
     summary: str = ""
-    """One-line description."""
 
 
 _OWN = {

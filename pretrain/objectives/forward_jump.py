@@ -17,14 +17,8 @@ Differences and readings:
 
 from __future__ import annotations
 
-from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.objective import ActionOptions, StateInverse
+from vd4rl_pomdp.nn.objective import StateInverse
 
 
 class ForwardJump(StateInverse):
     """FJ (a GRU over m+1 observations) and FJ+A (which also reads actions)."""
-
-    def __init__(self, encoder: Encoder, target: ActionTarget, options: ActionOptions, seed: int) -> None:
-        super().__init__(encoder, target, options, seed)
-        assert encoder.config.history_window > 0, "a forward jump needs a bounded past"

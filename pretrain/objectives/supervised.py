@@ -66,10 +66,10 @@ class Supervised(Objective):
         """MSE over coordinates and real rows with a known state; `pose_loss` and `velocity_loss` are its two parts."""
         assert isinstance(window, StateWindows), "windows without states train no supervised reference"
         truth = (window.state[..., self.columns] - self.mean) / self.std
-        told = window.real & ~truth.isnan().any(-1)
+        known = window.real & ~truth.isnan().any(-1)
         truth = truth.nan_to_num()  # before the loss: NaN times zero would be NaN
         errors = (self.head(self.encoder.encode(window)).to(truth) - truth).square()
-        real = told.to(errors)[..., None]
+        real = known.to(errors)[..., None]
         error = (errors * real).sum((0, 1)) / real.sum().clamp(min=1)  # all episodes of a batch may be held out
         loss, parts = error.mean(), {"pose_loss": error[: self.pose], "velocity_loss": error[self.pose :]}
         return loss, {"loss": loss.detach()} | {name: e.mean().detach() for name, e in parts.items() if len(e)}

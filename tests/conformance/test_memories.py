@@ -1,7 +1,5 @@
 """Every memory keeps the contract of memories, another one finds its way in, and what breaks it is caught."""
 
-import json
-
 import pytest
 import torch
 
@@ -10,7 +8,6 @@ from pretrain.train import pretrain
 from tests.helpers_pages import isolated_registries, load_example
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.memory import GRU, MEMORIES, GRUOptions, MemoryPart
 from vd4rl_pomdp.testing import check_memory, check_method
 from vd4rl_pomdp.testing.contract import run_check
@@ -45,28 +42,16 @@ def test_a_memory_keeps_its_promises(check, name, options):
 
 
 @pytest.fixture
-def memories(tmp_path, monkeypatch):
-    with isolated_registries():
-        load_example("my_memory.py", tmp_path, monkeypatch)
+def memories():
+    with MEMORIES.isolated():
         yield MEMORIES
 
 
-def test_the_pages_memory_keeps_its_promises_and_those_of_the_methods_it_is_chosen_for(memories):
-    check_memory("linear")
-    check_memory("linear", slowest=0.9)
-    check_method("mik+a", history="linear")
-    check_method("fj+a", history="linear")
-
-
-def test_mik_a_trains_with_another_memory_and_its_encoder_is_used_and_named(memories, data, own_cache, tmp_path):
-    chosen = {"method": "mik+a", "history": "linear", "slowest": 0.9, "steps": 1}
-    made = pretrain(smoke_pretrain(data, tmp_path / "pretrained", **chosen)).path
-    encoder, _ = load_encoder(made / "encoder")
-    assert (encoder.config.history, encoder.config.memory_options) == ("linear", {"slowest": 0.9})
-    record = json.loads((made / "config.json").read_text())
-    assert record["plugins"] == {"history linear": "registered by a call"}
-    brief = {"updates": 1, "batch_size": 4, "eval_length": 2}
-    assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
+def test_methods_keep_their_promises_with_the_pages_memory(tmp_path, monkeypatch):
+    with isolated_registries():
+        load_example("my_memory.py", tmp_path, monkeypatch)
+        check_method("mik+a", history="linear")
+        check_method("fj+a", history="linear")
 
 
 @pytest.mark.parametrize("history", ["transformer", "lru"])
@@ -133,7 +118,7 @@ class Hidden(GRU):
             r"row 0 of window 1 has gradients to \(window, row\) \[\(1, 0\), ",
         ),
         (Short, a_state_depends_on_its_past_alone, "only rows 1 to 2 of window 1 may have one"),
-        (Forgetful, streaming_equals_batch, "they differ at row 1"),
+        (Forgetful, streaming_equals_batch, "they differ for"),
         (Peeking, observations_are_read_where_it_says, "o_1 moves rows"),
         (Wide, outputs_have_one_shape, r"\(3, 6, 14\)"),
         (Unused, gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),

@@ -68,12 +68,6 @@ class Mean(Objective):
         return loss, {"loss": loss.detach()}
 
 
-class Vector(Mean):
-    def loss(self, window, progress):
-        loss, logs = super().loss(window, progress)
-        return loss[None], logs
-
-
 class Diverged(Mean):
     def loss(self, window, progress):
         loss = super().loss(window, progress)[0] / 0
@@ -84,11 +78,6 @@ class Attached(Mean):
     def loss(self, window, progress):
         loss, _ = super().loss(window, progress)
         return loss, {"loss": loss}
-
-
-class Unlogged(Mean):
-    def loss(self, window, progress):
-        return super().loss(window, progress)[0], {}
 
 
 class Misreported(Mean):
@@ -161,16 +150,9 @@ class Undeclared(StateInverse):
         return {t, t + k - 1}, set()
 
 
-class Broken(Mean):
-    def loss(self, window, progress):
-        raise RuntimeError("a shape does not fit")
-
-
 MUTANTS = [
-    (Vector, a_loss_is_a_finite_scalar, r"its shape is \(1,\)"),
     (Diverged, a_loss_is_a_finite_scalar, "it is inf"),
     (Attached, a_loss_is_a_finite_scalar, "loss is logged with its graph"),
-    (Unlogged, a_loss_is_a_finite_scalar, "no `loss` is logged, only none"),
     (Misreported, a_loss_is_a_finite_scalar, "is logged, the loss is"),
     (Frozen, a_loss_moves_the_whole_encoder, "none reaches frame.project.0.bias"),
     (Still, steps_lower_the_loss, "the mean of the first five is"),
@@ -179,7 +161,6 @@ MUTANTS = [
     (Unmasked, padding_changes_no_loss, "leave out rows beyond `real`"),
     (Looking, streaming_equals_batch, "the two differ"),
     (Undeclared, predictions_depend_on_what_is_declared, "the prediction of a_0 from rows 0 and 1 has gradients to"),
-    (Broken, a_loss_is_a_finite_scalar, "RuntimeError: a shape does not fit"),
 ]
 
 

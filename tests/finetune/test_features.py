@@ -104,7 +104,7 @@ def test_exact_batches_agree_with_cached_features(encoder, data):
     torch.testing.assert_close(batch.z, cached[rows], atol=1e-5, rtol=1e-4)
     next_rows = torch.minimum(rows + 3, dataset.episode_end[dataset.episode[rows]] - 1)
     torch.testing.assert_close(batch.next_z, cached[next_rows], atol=1e-5, rtol=1e-4)
-    told = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), cached[None], 16, 3, 0.99, sampler.draws).told[index]
+    told = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), cached[None], 16, 3, 0.99, sampler.draws).data[index]
     expected = torch.cat([batch.action, batch.next_action, batch.reward[:, None], batch.discount[:, None]], 1)
     assert torch.equal(told, expected)
 

@@ -197,7 +197,7 @@ def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_pat
     def broken(config, *more):
         made = make(config, *more)
         if config.seed == 1:
-            made.sampler.told[:, -2] = float("inf")
+            made.sampler.data[:, -2] = float("inf")
         return made
 
     with monkeypatch.context() as patch:

@@ -1,6 +1,5 @@
 """States with noise of a probe's size: as large as asked, drawn like a corruption, none where none was asked for."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -162,13 +161,6 @@ def test_evaluation_repeats_whatever_the_number_of_workers(noisy, plain, tmp_pat
     alone = totals(noisy, 1)
     assert totals(noisy, 2) == alone
     assert not set(totals(plain, 1)) & set(alone), "the noise changes what is done"
-
-
-def test_without_noise_states_are_handed_through(with_states, plain):
-    assert json.loads((plain / "config.json").read_text())["encoder"]["frame_options"] == {}
-    dataset = open_dataset(with_states)
-    made = frozen(plain, dataset)
-    assert torch.equal(made.episode(1, made.view(0)), dataset.states()[ROWS : 2 * ROWS])
 
 
 def test_either_kind_of_noise_leaves_the_other_coordinates_alone(with_states, tmp_path):

@@ -128,19 +128,10 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
-@pytest.mark.parametrize(
-    ("settings", "told"),
-    [
-        ({"updates": 0}, "--updates is 0; it must be at least 1"),
-        ({"gamma": 1.5}, "--gamma is 1.5; it must be at least 0 and at most 1"),
-        ({"n_step": 0}, "--n-step is 0"),
-        ({"learning_rate": float("nan")}, "--learning-rate is nan"),
-        ({"device": "cuda:99"}, "no such GPU"),
-    ],
-)
-def test_wrong_settings_are_one_line_and_leave_no_run_behind(data, encoder, tmp_path, settings, told):
-    with pytest.raises(UserError, match=told):
-        run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **settings))
+def test_a_gpu_that_there_is_not_leaves_no_run_behind(data, encoder, tmp_path):
+    """Other wrong values are in `test_bad_flags.py`."""
+    with pytest.raises(UserError, match="no such GPU"):
+        run_finetune(smoke_finetune(encoder, data, tmp_path / "out", device="cuda:99"))
     assert not (tmp_path / "out").exists()
 
 
@@ -220,6 +211,7 @@ def test_a_run_ends_with_what_its_critic_came_to(encoder, data, tmp_path, algori
     changes = {"updates": 15, "log_every": 1, "batch_size": 4, "eval_length": 2, "eval_every": 15, "eval_clean": False}
     changes |= {} if algorithm == "bc" else {"gamma": 0.9, "n_step": 2}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", algorithm=algorithm, **changes))
+    assert {row["evaluated_under"] for row in csv.DictReader((run.path / "episodes.csv").open())} == {CORRUPTION}
     told = json.loads((run.path / "critic.json").read_text())
     if algorithm == "bc":
         assert told == {}
@@ -273,13 +265,6 @@ def test_the_cost_of_the_pretraining_comes_along_with_a_copied_encoder(encoder, 
     again = run_finetune(smoke_finetune(first / "encoder", data, tmp_path / "again", **few)).path
     told = [json.loads(path.read_text()) for path in (encoder.parent / "timing.json", again / "pretrain_timing.json")]
     assert told[0] == told[1]
-
-
-def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
-    changes = {"updates": 2, "batch_size": 4, "eval_length": 2, "eval_clean": False}
-    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **changes))
-    rows = list(csv.DictReader((run.path / "episodes.csv").open()))
-    assert [row["evaluated_under"] for row in rows] == ["patch+zero_frames"]
 
 
 @pytest.mark.parametrize(("views", "hidden_dim", "threads"), [(1, 32, 1), (0, 32, 2), (1, 513, 2)])

@@ -5,45 +5,23 @@ import pytest
 import torch
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.types import Windows
+from vd4rl_pomdp.core.types import Windows, previous
 from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder
-from vd4rl_pomdp.nn.memory import GRU, GRUOptions, run_backward, run_memory, run_over_next, run_over_versions
+from vd4rl_pomdp.nn.memory import GRU, GRUOptions, run_memory, run_over_next, run_over_versions
 
 CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 10, "smoke")
 
 
-def make(history: str, use_actions: bool, span: int = 0, layers: int = 1) -> Encoder:
+def make(history: str, use_actions: bool) -> Encoder:
     torch.manual_seed(0)
-    told = {} if history == "none" else {"gru_layers": layers}
-    config = EncoderConfig(2, "nature", 16, history, use_actions, 12, span, memory_options=told)
-    return Encoder(config).eval()
+    return Encoder(EncoderConfig(2, "nature", 16, history, use_actions, 12)).eval()
 
 
-def window(rows: int = 9, batch: int = 2) -> Windows:
+def window() -> Windows:
     g = torch.Generator().manual_seed(1)
-    action = torch.rand(batch, rows, 2, generator=g)
-    return Windows(
-        obs=torch.randint(0, 256, (batch, rows, 9, 84, 84), generator=g, dtype=torch.uint8),
-        prev_action=torch.cat([torch.zeros(batch, 1, 2), action[:, :-1]], 1),
-        action=action,
-        has_action=torch.ones(batch, rows, dtype=torch.bool),
-        length=torch.full((batch,), rows),
-        key=torch.zeros(batch, rows, dtype=torch.int64),
-    )
-
-
-@pytest.mark.parametrize(
-    ("history", "use_actions", "span", "layers"),
-    [("none", False, 0, 1), ("gru", False, 0, 1), ("gru", True, 0, 2), ("gru", True, 4, 1), ("gru", False, 3, 2)],
-)
-def test_streaming_and_batch_encodings_agree(history: str, use_actions: bool, span: int, layers: int):
-    encoder, batch = make(history, use_actions, span, layers), window()
-    with torch.no_grad():
-        whole = encoder.encode(batch)
-        state = encoder.initial_state(2)
-        for t in range(9):
-            z, state = encoder.step(batch.obs[:, t], batch.prev_action[:, t], state)
-            torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
+    obs = torch.randint(0, 256, (2, 9, 9, 84, 84), generator=g, dtype=torch.uint8)
+    action, real = torch.rand(2, 9, 2, generator=g), torch.ones(2, 9, dtype=torch.bool)
+    return Windows(obs, previous(action), action, real, torch.full((2,), 9), torch.zeros(2, 9, dtype=torch.int64))
 
 
 @pytest.mark.parametrize(
@@ -65,42 +43,6 @@ def test_observations_of_another_shape_are_refused():
             encoder.encode(other.replace(obs=obs))
         with pytest.raises(UserError, match="pretrain an encoder on these"):
             encoder.step(obs[:, 0], other.prev_action[:, 0], encoder.initial_state(len(obs)))
-
-
-@pytest.mark.parametrize("span", [0, 3])
-def test_a_readout_is_the_frame_the_state_or_both_in_streams_and_batches(span: int):
-    batch, read = window(), {}
-    for readout in ("frame", "state", "frame+state"):
-        encoder = make("gru", True, span)
-        encoder.config = replace(encoder.config, readout=readout)
-        with torch.no_grad():
-            read[readout], state = encoder.encode(batch), encoder.initial_state(2)
-            assert read[readout].shape == (2, 9, encoder.dim)
-            for t in range(9):
-                z, state = encoder.step(batch.obs[:, t], batch.prev_action[:, t], state)
-                torch.testing.assert_close(z, read[readout][:, t], atol=1e-5, rtol=1e-4)
-            torch.testing.assert_close(encoder.frame(batch.obs), read["frame"])
-    assert torch.equal(read["frame+state"], torch.cat([read["frame"], read["state"]], dim=-1))
-
-
-def test_a_history_window_forgets_what_is_before_it_and_only_that():
-    encoder, batch = make("gru", True, span=3), window()
-    changed = batch.replace(obs=batch.obs.clone(), prev_action=batch.prev_action.clone())
-    changed.obs[:, 4], changed.prev_action[:, 5] = 0, 9.0
-    with torch.no_grad():
-        moved = (encoder.encode(batch) - encoder.encode(changed)).abs().amax((0, 2)) > 1e-6
-    # row 4's frame reaches rows 4..6; a_4 (row 5) reaches rows 5 and 6: in row 7 it would come from the first row
-    assert moved.tolist() == [False] * 4 + [True, True, True] + [False] * 2
-
-
-def test_the_backward_gru_starts_at_each_windows_last_real_row():
-    torch.manual_seed(0)
-    gru = GRU(3, GRUOptions(hidden_dim=4))
-    x, length = torch.randn(2, 6, 3), torch.tensor([6, 4])
-    out = run_backward(gru, x, length)
-    for b in range(2):
-        alone, _ = run_memory(gru, x[b : b + 1, : length[b]].flip(1))
-        torch.testing.assert_close(out[b, : length[b]], alone[0].flip(0))
 
 
 @pytest.mark.parametrize("span", [None, 1, 2, 5, 99])

@@ -9,7 +9,7 @@ from torch.nn.functional import gelu, layer_norm, silu, softmax
 from pretrain.config import PretrainConfig
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.memories.lru import scan
-from vd4rl_pomdp.nn.memory import MEMORIES, LRUOptions, TransformerOptions, make_memory, run_memory
+from vd4rl_pomdp.nn.memory import MEMORIES, make_memory, run_memory
 
 ROWS, WINDOW = 11, 4
 
@@ -152,11 +152,3 @@ def test_a_memory_decides_nothing_by_a_value(name):
 def test_options_that_cannot_work_are_refused(settings, told):
     with pytest.raises(UserError, match=told):
         PretrainConfig.of("smoke", **settings).check()
-
-
-def test_options_of_one_memory_are_not_anothers():
-    for history, option in (("lru", "gru_layers"), ("gru", "attention_window"), ("transformer", "r_min")):
-        with pytest.raises(UserError, match="is not read by"):
-            PretrainConfig.of("smoke", history=history, **{option: 2})
-    assert PretrainConfig.of("smoke", history="transformer").memory == TransformerOptions(hidden_dim=32)
-    assert PretrainConfig.of("smoke", history="lru").memory == LRUOptions(hidden_dim=32)

@@ -9,7 +9,14 @@ import yaml
 from huggingface_hub import ModelCard
 
 from tests.nn.test_encoder import CARD, make
-from vd4rl_pomdp.nn.encoder_folder import copy_encoder, encoder_hash, model_card, read_record, save_encoder, tell_probe
+from vd4rl_pomdp.nn.encoder_folder import (
+    copy_encoder,
+    encoder_hash,
+    model_card,
+    read_record,
+    record_probe,
+    save_encoder,
+)
 
 
 def cells(text: str) -> dict[str, str]:
@@ -47,7 +54,7 @@ def test_its_code_loads_the_encoder(folder, monkeypatch, capsys):
 
 def test_an_encoders_name_changes_with_its_weights_and_config_only(folder, tmp_path):
     name = encoder_hash(folder)
-    tell_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
+    record_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
     assert encoder_hash(folder) == name
     config = json.loads((folder / "config.json").read_text())
     (folder / "README.md").unlink()
@@ -58,7 +65,7 @@ def test_an_encoders_name_changes_with_its_weights_and_config_only(folder, tmp_p
 
 
 def test_a_probe_is_told_and_copied(folder, tmp_path):
-    tell_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
+    record_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
     copy_encoder(folder, tmp_path / "copy", {"readout": "state"})
     told = cells((tmp_path / "copy" / "README.md").read_text())["linear probe"]
     assert told == "error of pose 12.3%, velocity 56.0% of a standard deviation, on held-out episodes"

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from tests.conformance.test_methods import ROWS, batch, build
-from vd4rl_pomdp.nn.memory import run_memory
 
 
 def assert_same_logits(first: torch.nn.Module, second: torch.nn.Module) -> None:
@@ -36,27 +35,8 @@ def test_mik_with_a_long_future_is_mik():
     assert_same_logits(build("mik+a", n=ROWS), build("mik+a"))
 
 
-def test_mik_with_a_future_of_one_row_sees_that_row_alone():
-    objective, window = build("mik", n=0), batch()
-    future = objective.representations(window)[1]
-    features = objective.encoder.frame(window.obs)
-    alone = torch.stack([run_memory(objective.backward_memory, features[:, j : j + 1])[0][:, 0] for j in range(4)], 1)
-    torch.testing.assert_close(future[:, :4], alone, atol=1e-6, rtol=1e-6)
-
-
 def test_no_history_is_acro():
     assert_same_logits(build("acro"), build("no_history"))
-
-
-def test_padding_a_window_leaves_its_logits():
-    for method in ("mik+a", "mik", "fj+a", "ah", "acro"):
-        objective = build(method, **({"m": 2, "n": 1} if method == "mik" else {}))
-        whole, padded = batch((4, 4)), batch((4, 4))
-        short = whole.replace(**{n: whole[n][:, :4] for n in ("obs", "prev_action", "action", "has_action", "key")})
-        pairs = objective.pairs(ROWS)
-        inside = pairs.sum(1) < 4
-        logits = objective.action_logits(padded)[:, inside]
-        torch.testing.assert_close(logits, objective.action_logits(short), atol=1e-6, rtol=1e-6)
 
 
 def test_a_gap_that_a_method_never_scores_is_logged_by_no_number():

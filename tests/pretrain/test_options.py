@@ -22,6 +22,7 @@ from vd4rl_pomdp.studies.navigation.config import NavigationConfig
         ({"method": "state", "feature_dim": 3}, "the method state"),
         ({"method": "supervised+a", "pose_noise": 3.0}, "the method supervised.a"),
         ({"method": "mik+a", "codes": 7, "action_target": "mse"}, "the action target mse"),
+        ({"history": "lru", "gru_layers": 2}, "the history lru"),
         ({"patch_size": 8}, "the corruption none"),
         ({"corruption": "patch", "zeroed_frames": 1}, "the corruption patch"),
         ({"no_such_setting": 1}, "the method"),
@@ -99,12 +100,8 @@ def test_a_gap_beyond_the_window_is_refused(max_k, window):
     ("settings", "message"),
     [
         ({"max_k": 0}, "--max-k is 0"),
-        ({"codes": 0}, "--codes is 0"),
-        ({"n": -1}, "--n is -1"),
         ({"self_prediction": float("nan")}, "--self-prediction is nan"),
         ({"corruption": "patch", "patch_fill": 256}, "--patch-fill is 256"),
-        ({"corruption": "zero_frames", "zeroed_frames": 0}, "--zeroed-frames is 0"),
-        ({"method": "homer", "homer_codes": -1}, "--homer-codes is -1"),
         ({"action_target": "ordinal"}, "unknown action target 'ordinal'"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
         ({"method": "mik", "history": "none"}, "unknown --history 'none': choose one of method, gru"),
@@ -122,8 +119,6 @@ def test_values_that_cannot_work_are_refused(settings, message):
     [
         ({"method": "ah+a", "literal_future": True}, "literal-future"),
         ({"method": "no_history", "m": 3}, "m"),
-        ({"method": "supervised", "self_prediction": 1.0}, "self-prediction"),
-        ({"method": "random", "n": 3}, "n"),
         ({"exogenous_weight": 0.2}, "exogenous-weight"),
         ({"history_window": 3}, "history-window"),
     ],
@@ -136,20 +131,6 @@ def test_what_a_navigation_run_does_not_read_is_refused(settings, flag):
 @pytest.mark.parametrize("method", ["random", "supervised+a", "mik+a", "fj", "no_history"])
 def test_the_grids_settings_are_read(method):
     NavigationConfig.of("smoke", method=method, max_k=15).check()
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "reads"),
-    [("td3_bc", ["alpha"]), ("drqv2_bc", ["alpha"]), ("iql", ["expectile", "temperature"]), ("bc", [])],
-)
-def test_an_algorithm_reads_its_own_options_only(algorithm, reads):
-    for name in ("alpha", "expectile", "temperature"):
-        given = {"algorithm": algorithm, name: 0.5}
-        if name in reads:
-            assert flat(FinetuneConfig.of("smoke", **given))[name] == 0.5
-        else:
-            with pytest.raises(UserError, match=f"--{name} is not read by the algorithm {algorithm}"):
-                FinetuneConfig.of("smoke", **given)
 
 
 def test_an_encoder_that_is_trained_brings_its_algorithm_and_has_no_views_and_no_memory():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import CURL
+from baselines.curl import CURL
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS

@@ -39,7 +39,6 @@ class KMeansTarget(nn.Module):
         self.centers: Tensor
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
-        """See `ActionTarget`."""
         code = torch.cdist(action.reshape(-1, action.shape[-1]), self.centers).argmin(-1)
         loss = F.cross_entropy(logits.reshape(-1, self.outputs).float(), code, reduction="none")
         return loss.view(action.shape[:-1])
@@ -54,7 +53,6 @@ class BinsTarget(nn.Module):
         self.outputs = action_dim * bins
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
-        """See `ActionTarget`."""
         code = ((action.clamp(-1, 1) + 1) / 2 * self.bins).long().clamp_(max=self.bins - 1)
         loss = F.cross_entropy(logits.reshape(-1, self.bins).float(), code.reshape(-1), reduction="none")
         return loss.view(action.shape).mean(-1)
@@ -69,7 +67,6 @@ class MSETarget(nn.Module):
         self.normalise = normalise
 
     def loss(self, logits: Tensor, action: Tensor) -> Tensor:
-        """See `ActionTarget`."""
         if self.normalise:
             logits, action = F.normalize(logits.float(), dim=-1), F.normalize(action, dim=-1)
         return (logits.float() - action).square().mean(-1)
@@ -95,14 +92,7 @@ def target_options(name: str) -> type[Options]:
 
 
 def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) -> KMeansTarget | BinsTarget | MSETarget:
-    """Build an action target.
-
-    Args:
-        name: kmeans, bins, mse or mse_l2.
-        actions: (N, A) float32 training actions; K-means is fitted to them.
-        codes: number of K-means centres, or of bins per dimension; ignored by mse and mse_l2.
-        seed: the run's seed, for K-means.
-    """
+    """Build an action target; K-means is fitted to `actions`, the (N, A) float32 training actions."""
     if name == "kmeans":
         return KMeansTarget(actions, codes, seed)
     if name == "bins":

@@ -26,13 +26,7 @@ class Adam(torch.optim.Adam):
     step = torch.no_grad()(unwrap(torch.optim.Adam.step))
 
     def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float, fused: bool = False) -> None:
-        """Initialise.
-
-        Args:
-            parameters: parameters, all on one device.
-            learning_rate: the same for all.
-            fused: use PyTorch's fused step on a CPU, which rounds differently; a GPU always uses it.
-        """
+        """Initialise; `fused` uses PyTorch's fused step on a CPU, which rounds differently; a GPU always uses it."""
         parameters = list(parameters)
         device = parameters[0].device
         gpu = device.type == "cuda"

@@ -49,7 +49,6 @@ class EncoderConfig:
 
     @property
     def dim(self) -> int:
-        """Dimension of the representation."""
         widths = {"frame": self.feature_dim, "state": self.hidden_dim}
         return widths["frame"] if self.history == "none" else sum(widths[part] for part in self.readout.split("+"))
 
@@ -128,8 +127,8 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
-            told = {"feature_dim": config.feature_dim} | config.frame_options
-            self.frame = frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, told)
+            options = {"feature_dim": config.feature_dim} | config.frame_options
+            self.frame = frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
             self.config = config = replace(config, frame_options=config.frame_options | frame.found)
         if config.history == "none":
             return
@@ -144,17 +143,15 @@ class Encoder(nn.Module):
 
     @property
     def _row_width(self) -> int:
-        """Input width of the memory."""
         return self.config.feature_dim + (self.config.action_dim if self.config.use_actions else 0)
 
     def make_memory(self, inputs: int) -> Memory:
         """New memory of the same kind and options for rows of width `inputs`, such as MIK's backward memory."""
-        told = {"hidden_dim": self.config.hidden_dim} | self.config.memory_options
-        return make_memory(self.config.history, inputs, told, self.config.feature_dim)
+        options = {"hidden_dim": self.config.hidden_dim} | self.config.memory_options
+        return make_memory(self.config.history, inputs, options, self.config.feature_dim)
 
     @property
     def dim(self) -> int:
-        """Dimension of the representation."""
         return self.config.dim
 
     @property
@@ -198,27 +195,15 @@ class Encoder(nn.Module):
         return self._read(features, torch.cat([first, later.view(*recent.shape[:2], -1)], dim=1))
 
     def initial_state(self, batch: int) -> StreamState:
-        """State at the start of an episode."""
         weight = next(self.parameters())
-        hidden, rows = weight.new_zeros(0), weight.new_zeros(0)
-        if self.memory is not None:
-            hidden = self.memory.initial_state(batch)
-            rows = weight.new_zeros(batch, 0, self._row_width)
-        return StreamState(hidden, rows)
+        if self.memory is None:
+            return StreamState(weight.new_zeros(0), weight.new_zeros(0))
+        return StreamState(self.memory.initial_state(batch), weight.new_zeros(batch, 0, self._row_width))
 
     def step(self, obs: Tensor, prev_action: Tensor, state: StreamState) -> tuple[Tensor, StreamState]:
-        """Advance by one row.
+        """Advance by one row: (B, C, H, W) uint8, (B, A) -> (B, dim) and the next state; errors as in `encode`.
 
-        Args:
-            obs: (B, C, H, W) uint8.
-            prev_action: (B, A) float32, zeros at an episode's first row.
-            state: from `initial_state` or the previous call.
-
-        Returns:
-            (B, dim) representation, and the state for the next row.
-
-        Raises:
-            UserError: images of another shape than the encoder was built for.
+        `prev_action` is zero at an episode's first row.
         """
         self._refuse_other(obs)
         features = self.frame(obs)
@@ -245,7 +230,6 @@ class Encoder(nn.Module):
             )
 
     def _read(self, features: Tensor, states: Tensor) -> Tensor:
-        """The representation from e(o_t) (..., F) and s_t (..., H)."""
         return torch.cat([features, states], dim=-1) if self.config.readout == "frame+state" else states
 
     def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:

@@ -36,22 +36,14 @@ TAGS = ("reinforcement-learning", "offline-reinforcement-learning", "partial-obs
 
 
 def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:
-    """Write an encoder folder; every file is written atomically, config.json last.
-
-    Args:
-        folder: folder to write.
-        encoder: the encoder.
-        card: how it was pretrained.
-        frames: number of frames in all pretraining batches, if known.
-    """
+    """Write an encoder folder; `frames` is the number of frames in all pretraining batches, if known."""
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
-    told = code_of(record.parts)
-    _write(Path(folder), replace(record, plugins=told["plugins"], sources=told["sources"]), save(weights))
+    _write(Path(folder), replace(record, **code_of(record.parts)), save(weights))
 
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
-    """Write all files, config.json last: without it a folder does not count as an encoder folder."""
+    """Write each file atomically, config.json last: without it a folder does not count as an encoder folder."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / WEIGHTS, weights)
@@ -60,18 +52,12 @@ def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
 
 
 def copy_encoder(source: Path, target: Path, changes: Mapping[str, Any]) -> None:
-    """Copy an encoder folder, changing fields of its config.
-
-    Args:
-        source: an encoder folder.
-        target: folder to write.
-        changes: new values of `EncoderConfig` fields, such as {"readout": "frame"}.
-    """
+    """Copy an encoder folder; `changes` are new values of `EncoderConfig` fields, such as {"readout": "frame"}."""
     record = read_record(source)
     _write(target, replace(record, encoder=replace(record.encoder, **changes)), read_bytes(source / WEIGHTS))
 
 
-def tell_probe(folder: Path, errors: Mapping[str, float]) -> None:
+def record_probe(folder: Path, errors: Mapping[str, float]) -> None:
     """Record linear probe errors (see `EncoderRecord.probe`) in an encoder folder's config.json and model card."""
     _write(folder, replace(read_record(folder), probe=dict(errors)), read_bytes(folder / WEIGHTS))
 
@@ -87,36 +73,26 @@ def load_encoder(
 ) -> tuple[Encoder, EncoderCard]:
     """Load an encoder folder as a frozen module in eval mode.
 
-    Args:
-        folder: written by `save_encoder`.
-        task: if given, the task it must have been pretrained on.
-        action_dim: if given, the action dimension it must have.
-        size: if given, the image height and width it must have; not checked for state encoders.
-
-    Raises:
-        UserError: the folder is missing, damaged or a pickle, or one of the checks fails.
+    UserError if it is missing, damaged or a pickle, or was pretrained for another task, action dimension or image size
+    than given; state encoders have no image size.
     """
     folder = Path(folder)
     record = read_record(folder)
-    encoder_config, card = record.encoder, record.pretrain
-    if action_dim is not None and encoder_config.action_dim != action_dim:
-        raise UserError(
-            f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
-            f"the dataset has {action_dim}; pretrain one on this task"
+    config, card = record.encoder, record.pretrain
+    other = ""
+    if action_dim not in (None, config.action_dim):
+        other = (
+            f"was pretrained on {card.task} with {config.action_dim} action dimensions, the dataset has {action_dim}"
         )
-    trained = encoder_config.size
-    if size is not None and encoder_config.frame_encoder != STATE and trained != size:
-        raise UserError(
-            f"{folder}: this encoder reads images of {trained}x{trained} pixels, the dataset has {size}x{size}; "
-            "pretrain one on this dataset"
-        )
-    if task is not None and card.task != task:
-        raise UserError(
-            f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task"
-        )
+    elif size not in (None, config.size) and config.frame_encoder != STATE:
+        other = f"reads images of {config.size}x{config.size} pixels, the dataset has {size}x{size}"
+    elif task not in (None, card.task):
+        other = f"was pretrained on {card.task}, not on {task}"
+    if other:
+        raise UserError(f"{folder}: this encoder {other}; pretrain one on this dataset")
     try:
         with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
-            encoder = Encoder(encoder_config)
+            encoder = Encoder(config)
         CorruptionConfig.of(**card.corruption).check()
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(
@@ -159,8 +135,8 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
 
     Args:
         record: an encoder folder's config.json.
-        repository: OWNER/NAME on the Hub, for the loading example; empty: the example loads the card's own folder.
-        license: Hub identifier of the licence, such as "mit"; empty: none.
+        repository: OWNER/NAME on the Hub, to load from; empty: the example loads the card's own folder.
+        license: Hub identifier such as "mit"; empty: none.
     """
     card, shape = record.pretrain, record.encoder
     if card.end_to_end:
@@ -185,13 +161,13 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
     } | ({"licence": code(license)} if license else {})
     tags = dict.fromkeys([*TAGS, card.method, card.task, card.corruption["corruption"]])
     values: dict[str, Any] = {"license": license} if license else {}
-    values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0]}
+    values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0], "tags": [one_line(tag) for tag in tags]}
     hub = ["from huggingface_hub import snapshot_download", ""] if repository else []
     place = f"snapshot_download({json.dumps(repository)}))" if repository else '".")  # this folder'
     use = [f"encoder, card = load_encoder({place}", "print(card.method, card.task, encoder.dim)"]
     return "\n".join(
         [
-            *front_matter(values | {"tags": [one_line(tag) for tag in tags]}),
+            *front_matter(values),
             "",
             f"# {code(card.method)} on {code(card.task)}",
             "",

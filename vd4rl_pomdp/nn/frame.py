@@ -30,8 +30,8 @@ class FrameOptions(Options):
 
 def encoder_settings(options: Options) -> dict[str, Any]:
     """Split a frame encoder's options into the `EncoderConfig` fields `feature_dim` and `frame_options` (the rest)."""
-    told = asdict(options)
-    return {"feature_dim": told.pop("feature_dim"), "frame_options": told}
+    others = asdict(options)
+    return {"feature_dim": others.pop("feature_dim"), "frame_options": others}
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,7 @@ class FrameEncoderPart:
     [-0.5, 0.5]. Its optional attribute `found` is a dict of option values known only after building, such as the hash
     of the weights that a model name stands for; the encoder's config records them."""
     options: type[FrameOptions] = FrameOptions
-    """Class of its options."""
     summary: str = ""
-    """One-line description."""
 
 
 class FrameEncoder(nn.Module):
@@ -54,24 +52,17 @@ class FrameEncoder(nn.Module):
     Shapes: (..., C, size, size) uint8 or float in 0..255 -> (..., feature_dim) float32.
     """
 
-    def __init__(self, convolutions: nn.Module, channels: int, size: int, feature_dim: int) -> None:
+    def __init__(self, convolutions: nn.Module, map_shape: tuple[int, ...], feature_dim: int) -> None:
         super().__init__()
         self.convolutions = convolutions
         self.found: dict[str, Any] = getattr(convolutions, "found", {})
         """See `FrameEncoderPart.build`."""
-        with torch.no_grad():
-            maps = convolutions(torch.zeros(1, channels, size, size))
-        if not isinstance(maps, Tensor):
-            raise UserError(
-                f"a frame encoder's module must give feature maps (N, C', H', W'), not a {type(maps).__name__}"
-            )
-        self.map_shape = tuple(maps.shape[1:])
+        self.map_shape = map_shape
         """(C', H', W') of the feature maps."""
-        flat = math.prod(self.map_shape)
+        flat = math.prod(map_shape)
         self.project = nn.Sequential(nn.Linear(flat, feature_dim), nn.LayerNorm(feature_dim), nn.Tanh())
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Features of every stack."""
         return _features(self, obs, self._precision(obs))
 
     def maps(self, obs: Tensor) -> Tensor:
@@ -84,7 +75,6 @@ class FrameEncoder(nn.Module):
         return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
 
     def _precision(self, obs: Tensor) -> torch.dtype:
-        """Dtype that pixels are converted to."""
         if torch.is_autocast_enabled(obs.device.type):
             return torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor in memory
         return next(self.project.parameters()).dtype
@@ -103,34 +93,17 @@ def _features(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
     return encoder.from_maps(_maps.__wrapped__(encoder, obs, dtype))
 
 
-def _rectified(channels: int, *shapes: tuple[int, int, int]) -> list[nn.Module]:
-    """Convolutions with ReLU; each shape is (output channels, kernel size, stride)."""
-    layers: list[nn.Module] = []
-    for width, extent, stride in shapes:
-        layers += [nn.Conv2d(channels, width, extent, stride=stride), nn.ReLU()]
-        channels = width
-    return layers
+def _convolutions(*shapes: tuple[int, int, int], half: bool = False) -> Callable[..., nn.Sequential]:
+    """Builder of convolutions with ReLU, each (output channels, kernel, stride); `half`: after 2x2 mean pooling."""
 
+    def build(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
+        layers: list[nn.Module] = [nn.AvgPool2d(2, ceil_mode=True)] if half else []
+        for width, extent, stride in shapes:
+            layers += [nn.Conv2d(channels, width, extent, stride=stride), nn.ReLU()]
+            channels = width
+        return nn.Sequential(*layers)
 
-def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """Four 3x3 convolutions of 32 channels, the first with stride 2 (Kostrikov et al. 2020; used by V-D4RL)."""
-    return nn.Sequential(*_rectified(channels, (32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)))
-
-
-def _nature(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """Three convolutions, two of them strided (Mnih et al. 2015): a fraction of DrQ's cost."""
-    return nn.Sequential(*_rectified(channels, (32, 8, 4), (64, 4, 2), (64, 3, 1)))
-
-
-def _nature_half(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """Nature at half resolution: 2x2 average pooling, then a first convolution with half the kernel size and stride."""
-    half = nn.AvgPool2d(2, ceil_mode=True)
-    return nn.Sequential(half, *_rectified(channels, (32, 4, 2), (64, 4, 2), (64, 3, 1)))
-
-
-def _small(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """Three strided convolutions of 16 to 32 channels, for grey 50x50 images on a CPU."""
-    return nn.Sequential(*_rectified(channels, (16, 5, 2), (32, 3, 2), (32, 3, 2)))
+    return build
 
 
 _PATCH, _MIXER_DIM, _MIXER_LAYERS = 10, 256, 8
@@ -146,7 +119,6 @@ class MixerLayer(nn.Module):
         self.over_features = nn.Sequential(nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same shape."""
         x = x + self.over_patches(self.norms[0](x).transpose(1, 2)).transpose(1, 2)
         return x + self.over_features(self.norms[1](x))
 
@@ -177,11 +149,6 @@ def _mixer(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     return nn.Sequential(patches, _Patches(), *layers, nn.LayerNorm(_MIXER_DIM), _Pool())
 
 
-def _flat(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """No convolution, for observations of a few numbers, as in the finite worlds of the theory study."""
-    return nn.Sequential()
-
-
 @dataclass(frozen=True)
 class PretrainedOptions(FrameOptions):
     """Options of a frozen image model."""
@@ -194,11 +161,6 @@ class PretrainedOptions(FrameOptions):
     """Required content hash of the model's weights; empty: any. The hash used is recorded in the encoder's config."""
 
     limits: ClassVar[Limits] = {"model_size": (1, 4096)}
-
-
-def _pretrained(channels: int, size: int, options: PretrainedOptions) -> Pretrained:
-    """Frozen features of each frame from a transformers model; only the linear layer after them is trained."""
-    return Pretrained(options.model, options.model_size, options.weights, channels)
 
 
 STATE = "state"
@@ -215,19 +177,31 @@ def _refuse_part(name: str, part: FrameEncoderPart) -> None:
 FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     "frame encoder",
     {
-        "drq": FrameEncoderPart(_drq, summary="four 3x3 convolutions of 32 channels, as in DrQ and V-D4RL"),
-        "nature": FrameEncoderPart(
-            _nature, summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost"
+        # Kostrikov et al. 2020, arXiv 2004.13649
+        "drq": FrameEncoderPart(
+            _convolutions((32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)),
+            summary="four 3x3 convolutions of 32 channels, as in DrQ and V-D4RL",
         ),
-        "nature_half": FrameEncoderPart(_nature_half, summary="nature on pictures of half the resolution"),
+        # Mnih et al. 2015
+        "nature": FrameEncoderPart(
+            _convolutions((32, 8, 4), (64, 4, 2), (64, 3, 1)),
+            summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost",
+        ),
+        "nature_half": FrameEncoderPart(
+            _convolutions((32, 4, 2), (64, 4, 2), (64, 3, 1), half=True),
+            summary="nature on pictures of half the resolution",
+        ),
         "small": FrameEncoderPart(
-            _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
+            _convolutions((16, 5, 2), (32, 3, 2), (32, 3, 2)),
+            summary="three strided convolutions of few channels, for grey 50x50 pictures",
         ),
         "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels: the paper's on mazes"),
         "pretrained": FrameEncoderPart(
-            _pretrained, PretrainedOptions, "a frozen image model that transformers knows by name, DINOv2 by default"
+            lambda channels, size, options: Pretrained(options.model, options.model_size, options.weights, channels),
+            PretrainedOptions,
+            "a frozen image model that transformers knows by name, DINOv2 by default",
         ),
-        "flat": FrameEncoderPart(_flat, summary="no convolution, for observations of a few numbers"),
+        "flat": FrameEncoderPart(_convolutions(), summary="no convolution, for observations of a few numbers"),
     },
     lambda part: isinstance(part, FrameEncoderPart),
     "a vd4rl_pomdp.nn.frame.FrameEncoderPart",
@@ -251,16 +225,10 @@ class StateFrame(nn.Module):
         std: Sequence[float] = (),
         hidden_share: float = 0.0,
     ) -> None:
-        """Initialise.
+        """For P = `width` coordinates; ValueError if noise, mean or std is neither empty nor of length P.
 
-        Args:
-            width: number of coordinates P.
-            noise: standard deviation of the noise added to each coordinate; empty: no noise.
-            mean, std: statistics that standardise each coordinate; empty: states are not standardised.
-            hidden_share: probability of setting a coordinate to zero, its standardised mean.
-
-        Raises:
-            ValueError: noise, mean or std is neither empty nor of length P.
+        `noise` is the standard deviation of what is added to each coordinate, `mean` and `std` standardise it, and
+        `hidden_share` is the probability of setting it to zero, its standardised mean.
         """
         super().__init__()
         for values in (noise, mean, std):
@@ -273,11 +241,7 @@ class StateFrame(nn.Module):
         """Optimisers need at least one parameter, and weight files one tensor."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Features (..., P) float32: the state itself.
-
-        Raises:
-            UserError: the state has another width, as in earlier versions.
-        """
+        """The state itself; UserError if it has another width, as in earlier versions."""
         if obs.shape[-3] != self.width:
             raise UserError(
                 f"this encoder reads states of {self.width} coordinates, the task's have {obs.shape[-3]}: "
@@ -291,14 +255,9 @@ class StateFrame(nn.Module):
         return len(self.noise) > 0 or self.hidden_share > 0
 
     def observe(self, state: Tensor, key: Tensor) -> Tensor:
-        """Turn states into observations: add noise, standardise, hide coordinates.
+        """Turn states into observations: (..., P) float32, (...,) int64 -> (..., P, 1, 1) float32.
 
-        Args:
-            state: (..., P) float32.
-            key: (...,) int64 keys of the random draws; equal keys give equal noise and hidden coordinates.
-
-        Returns:
-            (..., P, 1, 1) float32.
+        Adds noise, standardises, hides coordinates; equal keys give equal draws.
         """
         if len(self.noise):
             state = (state + draw_normals(key, state.shape[-1]) * self.noise).float()
@@ -321,22 +280,24 @@ def make_frame_encoder(name: str, channels: int, size: int, settings: Mapping[st
     if unknown := settings.keys() - vars(options).keys():
         raise UserError(f"frame encoder {name!r} has no option {min(unknown)!r}")
     try:
-        maps = part.build(channels, size, options)
-        if not isinstance(maps, nn.Module):
-            raise UserError(
-                f"frame encoder {name!r} builds a {type(maps).__name__}, not a module: return what makes the maps"
-            )
-        encoder = FrameEncoder(maps, channels, size, options.feature_dim)
+        convolutions = part.build(channels, size, options)
+        if not isinstance(convolutions, nn.Module):
+            kind = type(convolutions).__name__
+            raise UserError(f"frame encoder {name!r} builds a {kind}, not a module: return what makes the maps")
+        with torch.no_grad():
+            maps = convolutions(torch.zeros(1, channels, size, size))
     except RuntimeError as error:
         raise UserError(
             f"frame encoder {name!r} cannot read images of {size}x{size} pixels ({first_line(error)}): choose "
             "another --frame-encoder, or a dataset of larger frames"
         ) from error
-    if len(encoder.map_shape) != 3:
+    if not isinstance(maps, Tensor) or maps.dim() != 4:
+        made = ("N", *maps.shape[1:]) if isinstance(maps, Tensor) else f"a {type(maps).__name__}"
         raise UserError(
-            f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N images, not maps (N, C', H', W'): "
+            f"frame encoder {name!r} makes {made} of N images, not maps (N, C', H', W'): "
             "give its module's output height and width, 1 for none"
         )
+    encoder = FrameEncoder(convolutions, tuple(maps.shape[1:]), options.feature_dim)
     for parameter in encoder.parameters():
         if parameter.dim() == 4:
             parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)

@@ -31,16 +31,7 @@ class PairHead(nn.Module):
         self.rest = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
 
     def forward(self, past: Tensor, future: Tensor, pairs: Tensor) -> Tensor:
-        """Outputs for every pair.
-
-        Args:
-            past: (B, T, past_dim).
-            future: (B, T, future_dim).
-            pairs: (P, 2) int64, each (t, k).
-
-        Returns:
-            (B, P, outputs).
-        """
+        """(B, T, past_dim), (B, T, future_dim) and pairs (P, 2) int64, each (t, k) -> (B, P, outputs)."""
         t, k = pairs.unbind(1)
         hidden = self.past(past).index_select(1, t) + self.future(future).index_select(1, t + k)
         if self.k is not None:
@@ -52,7 +43,6 @@ class ExactLinear(nn.Linear):
     """A linear layer with autocast disabled, for outputs whose small differences matter."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., inputs) -> (..., outputs)."""
         with torch.autocast(x.device.type, enabled=False):
             return super().forward(x.to(self.weight))
 
@@ -76,13 +66,12 @@ def all_pairs(rows: int, max_k: int) -> Tensor:
 def info_nce(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
     """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of identifying each anchor's positive.
 
+    Mean over anchors and leading dimensions, in nats; log(number of candidates) for constant scores.
+
     Args:
         scores: (..., N, N), anchors by candidates; positives are on the diagonal.
         group: (N,) int64; candidates of the anchor's own group are not used as negatives. None: all are.
         real: (N,) bool; rows where it is False are neither anchors nor candidates. None: all count.
-
-    Returns:
-        Mean over anchors and leading dimensions, in nats; log(number of candidates) for constant scores.
     """
     real = _unless_all(real)
     logits = _logits(scores, group, real)

@@ -20,25 +20,6 @@ from vd4rl_pomdp.nn.memories.base import GRU, GRUOptions, Integrator, Memory, Me
 from vd4rl_pomdp.nn.memories.lru import LRU, LRUOptions
 from vd4rl_pomdp.nn.memories.transformer import Transformer, TransformerOptions
 
-__all__ = [
-    "GRU",
-    "LRU",
-    "MEMORIES",
-    "GRUOptions",
-    "Integrator",
-    "LRUOptions",
-    "Memory",
-    "MemoryOptions",
-    "MemoryPart",
-    "Transformer",
-    "TransformerOptions",
-    "make_memory",
-    "run_backward",
-    "run_memory",
-    "run_over_next",
-    "run_over_versions",
-]
-
 
 @dataclass(frozen=True)
 class MemoryPart:
@@ -47,9 +28,7 @@ class MemoryPart:
     build: Callable[[int, Any], Memory]
     """Called with (input width I, options); usually the memory's class."""
     options: type[MemoryOptions] = MemoryOptions
-    """Class of its options."""
     summary: str = ""
-    """One-line description."""
 
 
 def _refuse_part(name: str, part: MemoryPart) -> None:
@@ -79,13 +58,9 @@ MEMORIES: Registry[MemoryPart] = Registry(
 
 
 def make_memory(name: str, inputs: int, settings: Mapping[str, Any], features: int | None = None) -> Memory:
-    """Build a memory by name; UserError for an unknown name or option.
+    """Build a memory by name for rows of `inputs` numbers; UserError for an unknown name or option.
 
-    Args:
-        name: name in MEMORIES.
-        inputs: width I of an input row.
-        settings: values of its options by name.
-        features: the first `features` inputs of a row are the observation's, the rest the action's; None: all.
+    The first `features` numbers are the observation's (None: all), the rest the action's.
     """
     part = MEMORIES.named(name)
     options = part.options.fill(settings)
@@ -107,15 +82,9 @@ def run_memory(memory: Memory, x: Tensor, state: Tensor | None = None) -> tuple[
 
 
 def run_backward(memory: Memory, x: Tensor, length: Tensor) -> Tensor:
-    """Run a memory from each window's last real row to its first.
+    """Run a memory from each window's last real row to its first: (B, T, I), (B,) int64 real rows -> (B, T, H).
 
-    Args:
-        memory: reads rows backwards.
-        x: (B, T, I) inputs; rows at and after `length` are padding.
-        length: (B,) int64.
-
-    Returns:
-        (B, T, H): output j depends on rows j..length-1. Outputs at padding rows are meaningless.
+    Output j depends on rows j..length-1. Outputs at padding rows are meaningless.
     """
     rows = torch.arange(x.shape[1], device=x.device)
     flip = length[:, None] - 1 - rows
@@ -141,16 +110,8 @@ def run_over_next(memory: Memory, x: Tensor, length: Tensor, span: int) -> Tenso
 def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor, span: int | None = None) -> Tensor:
     """Like `run_backward` (or `run_over_next` with a span), but a row's input depends on the state that reads it.
 
-    With MIK's `future_frames`, V = 3: state j reads row j with 1 frame, row j+1 with 2, and later rows with all 3.
-
-    Args:
-        memory: reads rows backwards.
-        versions: V tensors (B, T, I); state j reads row j+i from versions[min(i, V-1)].
-        length: (B,) int64.
-        span: rows per state; None: all up to the window's end.
-
-    Returns:
-        (B, T, H).
+    State j reads row j+i from versions[min(i, V-1)], V tensors (B, T, I). With MIK's `future_frames`, V = 3: state j
+    reads row j with 1 frame, row j+1 with 2, and later rows with all 3.
     """
     last = len(versions) - 1
     batch, rows, _ = versions[0].shape

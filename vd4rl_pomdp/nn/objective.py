@@ -85,7 +85,6 @@ class InverseOptions(ActionOptions):
 
     @property
     def largest_gap(self) -> int:
-        """K."""
         return self.max_k
 
 

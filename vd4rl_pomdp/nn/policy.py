@@ -44,7 +44,6 @@ class Standardise(nn.Module):
         self.std.copy_((squares / len(flat) - mean.square()).clamp(min=0).sqrt() + 1e-3)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Standardised copy of (..., dim)."""
         return (z.float() - self.mean) / self.std
 
 
@@ -58,11 +57,9 @@ class Policy(nn.Module):
         self.net = mlp(dim, hidden, action_dim, last=ExactLinear)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Mean action."""
         return self.from_standardised(self.standardise(z))
 
     def from_standardised(self, z: Tensor) -> Tensor:
-        """Mean action for representations that are already standardised."""
         return torch.tanh(self.net(z))
 
     def save(self, folder: Path | str, step: int | None = None) -> None:
@@ -90,5 +87,5 @@ def load_policy(folder: Path | str) -> Policy:
 def policy_step(folder: Path) -> int | None:
     """Training step stored with a policy folder's weights, None if there is none; UserError as `load_policy`."""
     with damaged(folder, *_NO_POLICY):
-        told = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
-        return None if told is None else int(told)
+        step = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
+        return None if step is None else int(step)

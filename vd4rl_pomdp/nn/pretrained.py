@@ -72,7 +72,6 @@ class Pretrained(nn.Module):
             raise UserError(f"--model {name}: its features of one image differ from call to call: choose another model")
 
     def forward(self, image: Tensor) -> Tensor:
-        """Features of every stack; see the class."""
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
         frames = (frames + 0.5 - self.mean) / self.std
         features = []

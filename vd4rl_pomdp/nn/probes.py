@@ -29,13 +29,8 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
     0 is perfect. Uninformative features, for which the best prediction is the mean, give 80 for normally distributed
     targets, less for heavier tails, and at most 100 on the training episodes.
 
-    Args:
-        features: (N, D) representations.
-        targets: (N, P) state variables; constant ones are left out (if all are constant, the error is 0).
-        episode: (N,) episode of every row, at least two; `held_out` picks the test episodes.
-
-    Raises:
-        UserError: there is only one episode.
+    From (N, D) representations, (N, P) state variables, of which constant ones are left out (if all are, the error is
+    0), and the (N,) episode of every row; errors as `held_out`, which picks the test episodes.
     """
     error = _errors(features, targets, held_out(episode))
     return float(np.abs(error).mean() * 100) if error.size else 0.0
@@ -68,14 +63,7 @@ def _errors(features: np.ndarray, targets: np.ndarray, test: np.ndarray) -> np.n
 
 
 def probe_state(features: np.ndarray, physics: np.ndarray, episode: np.ndarray, layout: Layout) -> dict[str, float]:
-    """`probe_error` for pose (without global position) and for velocity.
-
-    Args:
-        features: (N, D) representations.
-        physics: (N, P) simulator states.
-        episode: (N,) episode of every row.
-        layout: splits states into pose and velocity.
-    """
+    """`probe_error` for pose (without global position) and for velocity, from (N, P) simulator states."""
     return {
         "probe_pose": probe_error(features, layout.pose(physics), episode),
         "probe_velocity": probe_error(features, layout.velocity(physics), episode),

@@ -39,9 +39,6 @@ def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int =
         rows: rows T of each window, padding included.
         frames: check single frames against `objective.visible_frames` instead of rows.
 
-    Returns:
-        (window, t, k) of every pair that fails; empty if all pass.
-
     Raises:
         ValueError: a prediction depends on another window of the batch, or differs from call to call.
     """
@@ -72,8 +69,13 @@ def dependence(
     for p, (b, t, k) in _real_pairs(objective, lengths, rows):
         value = (logits[b, p] * weights).sum()
         grads = torch.autograd.grad(value, inputs, retain_graph=True, allow_unused=True)
-        places, used = (_rows_with_gradient(grad, b) for grad in grads)
-        found[b, t, k] = ({place - (obs.shape[1] - rows) for place in places}, used)
+        reached: list[set[int]] = []
+        for grad in grads:
+            touched = torch.zeros(len(lengths), 1) if grad is None else grad.flatten(2).abs().amax(2)
+            if touched[torch.arange(len(lengths)) != b].any():
+                raise ValueError("a prediction depends on another window of its batch")
+            reached.append(set(torch.nonzero(touched[b])[:, 0].tolist()))
+        found[b, t, k] = ({place - (obs.shape[1] - rows) for place in reached[0]}, reached[1])
     return found
 
 
@@ -99,16 +101,14 @@ def response(
             raise ValueError("a prediction depends on another window of its batch")
     found: dict[Pair, Seen] = {pair: (set(), set()) for _, pair in _real_pairs(objective, lengths, rows)}
     before = obs.shape[1] - rows
-    for place in range(obs.shape[1]):
-        touched = changed(_exchange(obs, new_obs, 1, place), actions)
+    for kind, place in [(0, place) for place in range(obs.shape[1])] + [(1, row) for row in range(rows)]:
+        if kind == 0:
+            touched = changed(_exchange(obs, new_obs, 1, place), actions)
+        else:
+            touched = changed(obs, _exchange(actions, new_actions, 1, place))
         for p, pair in _real_pairs(objective, lengths, rows):
             if touched[pair[0], p]:
-                found[pair][0].add(place - before)
-    for row in range(rows):
-        touched = changed(obs, _exchange(actions, new_actions, 1, row))
-        for p, pair in _real_pairs(objective, lengths, rows):
-            if touched[pair[0], p]:
-                found[pair][1].add(row)
+                found[pair][kind].add(place if kind else place - before)
     return found
 
 
@@ -121,15 +121,6 @@ def _real_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int) 
     """Yield (index among the pairs, (window, t, k)) for every pair within its window's real rows."""
     for p, (t, k) in enumerate(objective.pairs(rows).tolist()):
         yield from ((p, (b, t, k)) for b, length in enumerate(lengths) if t + k < length)
-
-
-def _rows_with_gradient(grad: Tensor | None, window: int) -> set[int]:
-    if grad is None:
-        return set()
-    touched = grad.flatten(2).abs().amax(2) > 0
-    if touched[torch.arange(len(touched)) != window].any():
-        raise ValueError("a prediction depends on another window of its batch")
-    return set(torch.nonzero(touched[window])[:, 0].tolist())
 
 
 def _exchange(values: Tensor, others: Tensor, axis: int, place: int) -> Tensor:

@@ -41,9 +41,6 @@ def compare_results(one: Path, other: Path) -> SideBySide:
 
     Conditions are those of a report of each set. They are matched by equal settings, whatever their names; then by
     name; then, if a method has a single variant in each set, by method.
-
-    Raises:
-        UserError: a path holds no evaluated run, or a file is damaged.
     """
     (mine, first), (theirs, second) = _loaded(one), _loaded(other)
     runs = [run for side in (first, second) for seeds in side.values() for run in seeds]

@@ -235,8 +235,7 @@ def labels(table: pd.DataFrame) -> pd.Series:
 def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choice = ALL) -> list[Run]:
     """The chosen runs at or below some run folders and results folders; `but` as in `find_results`.
 
-    Raises:
-        UserError: there is no run, two have the same identity, or a file of one is damaged.
+    UserError if there is no run, two have the same identity, or a file of one is damaged.
     """
     runs = _told_apart([_load(result) for result in choice.among(find_results(paths, but))])
     seen: dict[tuple[Any, ...], Path] = {}

@@ -110,14 +110,12 @@ def mean_interval(scores: np.ndarray) -> Interval | None:
     of seeds and then episodes, corrected for few seeds. None for a single seed, or if all scores are equal, since that
     says nothing about the spread over seeds.
     """
-    found = _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])
-    return found.interval if found else None
+    return found.interval if (found := _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])) else None
 
 
 def difference_interval(scores: np.ndarray, others: np.ndarray) -> Interval | None:
     """Like `mean_interval`, for the mean of (n, episodes) scores minus that of (m, episodes) others."""
-    found = difference(scores, others)
-    return found.interval if found else None
+    return found.interval if (found := difference(scores, others)) else None
 
 
 def difference(scores: np.ndarray, others: np.ndarray) -> Estimate | None:

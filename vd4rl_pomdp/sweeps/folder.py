@@ -45,8 +45,8 @@ _RATE_S = 3600.0
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
     """Name of the plan for a grid file and the words that narrow or change it, e.g. "ladder" or "ladder~1a2b3c4d"."""
-    told = sorted(words)
-    return f"{grid}~{hashlib.blake2b(json.dumps(told).encode(), digest_size=4).hexdigest()}" if told else grid
+    words = sorted(words)
+    return f"{grid}~{hashlib.blake2b(json.dumps(words).encode(), digest_size=4).hexdigest()}" if words else grid
 
 
 @dataclass(frozen=True)
@@ -83,25 +83,20 @@ class SweepFolder:
     def plans(self, name: str = "") -> list[Plan]:
         """The plan of that name, or all plans, with job folders resolved relative to `self.out`.
 
-        Raises:
-            UserError: no plan is there, or one is damaged.
+        UserError if no plan is there, or one is damaged.
         """
         paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
         if not paths:
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
-        plans = []
-        for plan in map(read_plan, paths):
-            jobs = [
-                replace(
-                    job,
-                    folder=self.out / job.folder.relative_to(plan.out)
-                    if job.folder.is_relative_to(plan.out)
-                    else plan.made_in / job.folder,  # a set that lies elsewhere
-                )
-                for job in plan.jobs
-            ]
-            plans.append(replace(plan, jobs=jobs))
-        return plans
+
+        def here(plan: Plan, folder: Path) -> Path:
+            inside = folder.is_relative_to(plan.out)  # else a set that lies elsewhere
+            return self.out / folder.relative_to(plan.out) if inside else plan.made_in / folder
+
+        plans = map(read_plan, paths)
+        return [
+            replace(plan, jobs=[replace(job, folder=here(plan, job.folder)) for job in plan.jobs]) for plan in plans
+        ]
 
     def plans_to_do(self, name: str = "") -> list[Plan]:
         """Like `plans`; UserError if the folder was moved, since the jobs' commands still name the old place."""
@@ -231,9 +226,9 @@ def in_lines(found: Mapping[str, Any], out: Path) -> list[str]:
     """A status as lines of text; `out` is the sweep's folder."""
     counts = ", ".join(f"{number} {state}" for state, number in sorted(found["counts"].items()))
     left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
-    shown = [
+    return [
         f"{len(found['states'])} jobs: {counts}",
         f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate",
+        *(failure(row, out) for row in found["failures"].values()),
+        *(f"running: {name}" for name, state in found["states"].items() if state == RUNNING),
     ]
-    shown += [failure(row, out) for row in found["failures"].values()]
-    return shown + [f"running: {name}" for name, state in found["states"].items() if state == RUNNING]

@@ -218,7 +218,7 @@ class _Planner:
         """Recipe by name, for names already taken."""
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
-        self._asked: set[str] = set()
+        self._requested: set[str] = set()
         """Names of jobs that end a cell's chain."""
         self._of_other_code: Counter[str] = Counter()
         self._of_other_content: Counter[str] = Counter()
@@ -240,7 +240,7 @@ class _Planner:
             # A policy's folder name also depends on the encoder's settings.
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
-        self._ask(before[-1], data)
+        self._request(before[-1], data)
 
     def _training(self, cell: GridCell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
         own = recipe_of(cell, section)
@@ -272,11 +272,11 @@ class _Planner:
             one for one in candidates if self._out / one not in self._folders and self._names.get(one, own) == own
         )
 
-    def _ask(self, job: Job, data: DataSet) -> None:
+    def _request(self, job: Job, data: DataSet) -> None:
         """Request a job for its own result, not as a dependency. A finished run among `kept` satisfies it."""
-        if job.name in self._asked:
+        if job.name in self._requested:
             return
-        self._asked.add(job.name)
+        self._requested.add(job.name)
         run = _found(self._kept, job.recipe, data)
         if run is None and any(data.alike(other.record) for other in self._kept.get(job.recipe, ())):
             self._of_other_content[data.name] += 1
@@ -292,7 +292,7 @@ class _Planner:
             if job.name in needed and job.section in STAGES:
                 job = replace(job, done=False)  # a kept row has no encoder to train on
             if not job.finished:
-                if job.name not in needed | self._asked:
+                if job.name not in needed | self._requested:
                     continue
                 needed |= set(job.needs)
             found.append(job)

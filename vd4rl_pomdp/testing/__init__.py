@@ -6,7 +6,7 @@
         check_method("past_to_frame")
 
 Each function builds the part at a small size, runs every check of its kind, and raises an AssertionError that says
-which promise is broken and how. An unknown name or option raises UserError.
+which promise is broken and how. An unknown name or option, or one with the name of another setting, raises UserError.
 """
 
 from vd4rl_pomdp.testing.algorithms import check_algorithm

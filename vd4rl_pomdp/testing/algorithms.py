@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
-from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+from vd4rl_pomdp.testing.contract import Check, claim, claim_close, claim_equal, listed, run_checks
 
 DIM, ACTIONS, SIZE = 3, 2, 32
 UPDATES = 4
@@ -26,16 +26,7 @@ UPDATES = 4
 
 
 def check_algorithm(name: str, **options: Any) -> None:
-    """Run all checks on a fine-tuning algorithm.
-
-    Args:
-        name: name in `finetune.algorithms.ALGORITHMS`.
-        options: its options.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such algorithm or option.
-    """
+    """Run all checks on a fine-tuning algorithm of `finetune.algorithms.ALGORITHMS`."""
     run_checks("algorithm", CHECKS, name, **options)
 
 
@@ -71,21 +62,21 @@ class Step:
     after: dict[str, Tensor]
 
 
-def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict[str, Tensor]]:
+def watched(algorithm: Algorithm, transitions: FeatureBatch) -> tuple[list[Step], dict[str, Tensor]]:
     """Run one update; returns its optimiser steps and its logs."""
-    z = given.z.requires_grad_()
+    z = transitions.z.requires_grad_()
     steps: list[Step] = []
     step = algorithm.step
 
     def watching(loss: Loss, *optimisers: Optimizer) -> None:
-        asked = [*_optimised(optimisers[0]), z]
-        reached = torch.autograd.grad(loss.value, asked, retain_graph=True, allow_unused=True)
+        inputs = [*_optimised(optimisers[0]), z]
+        reached = torch.autograd.grad(loss.value, inputs, retain_graph=True, allow_unused=True)
         before = _networks(algorithm)
         step(loss, *optimisers)
         steps.append(Step(loss, optimisers[0], list(reached), before, _networks(algorithm)))
 
     algorithm.step = watching  # type: ignore[method-assign]
-    logs = algorithm.update(given)
+    logs = algorithm.update(transitions)
     del algorithm.step
     claim(steps, "an update makes no optimiser step")
     return steps, logs
@@ -124,7 +115,7 @@ def losses_are_finite_scalars(name: str, **options: Any) -> None:
         steps, logs = watched(algorithm, batch(number))
         logged = [key for step in steps for key in step.loss.logs]
         claim(logged, f"update {number} logs nothing")
-        claim(sorted(logged) == sorted(logs), f"its losses log {shown(logged)}, the update returns {shown(logs)}")
+        claim(sorted(logged) == sorted(logs), f"its losses log {listed(logged)}, the update returns {listed(logs)}")
         claim("step" not in logs, "a log is called `step`, which numbers the rows of metrics: rename it")
         for key, value in {**{f"loss {i}": step.loss.value.detach() for i, step in enumerate(steps)}, **logs}.items():
             claim(value.shape == (), f"{key} has the shape {tuple(value.shape)}")
@@ -148,10 +139,10 @@ def a_loss_moves_what_its_optimiser_steps(name: str, **options: Any) -> None:
             missed = [tuple(p.shape) for p, gradient in reached if gradient is None or not gradient.any()]
             claim(missed == [], f"a loss has no gradient to parameters of the shapes {missed}")
             changed = _moved(step.before, step.after)
-            claim(changed == mine, f"the step moved {shown(changed)}, its optimiser has {shown(mine)}")
+            claim(changed == mine, f"the step moved {listed(changed)}, its optimiser has {listed(mine)}")
             policy_moved |= {key for key in changed if key.startswith("/policy/")}
     still = {f"/policy/net.{key}" for key in algorithm.policy.net.state_dict()} ^ policy_moved
-    claim(not still, f"after {UPDATES} updates, these were not trained, or should not have been: {shown(still)}")
+    claim(not still, f"after {UPDATES} updates, these were not trained, or should not have been: {listed(still)}")
 
 
 def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) -> None:
@@ -166,8 +157,8 @@ def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) 
         claim(gradient is not None and gradient.any(), "the first loss has none")
         claim(all(step.reached[-1] is None for step in others), "a later one has: detach `batch.z` for it")
     scale = nn.Parameter(torch.ones(()))
-    given = batch()
-    algorithm.update(given.replace(z=given.z * scale), torch.optim.SGD([scale], lr=1e-3))
+    transitions = batch()
+    algorithm.update(transitions.replace(z=transitions.z * scale), torch.optim.SGD([scale], lr=1e-3))
     claim(scale.item() != 1, "the encoder's optimiser takes no step: hand it to `step` with the first loss")
 
 
@@ -190,7 +181,7 @@ def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) ->
             tau = getattr(algorithm, "tau")  # noqa: B009 (algorithms without targets have none)
             claim_close(after[key], before[key].lerp(online, tau), f"{key} did not move by tau = {tau}")
         crept |= {key.split("/")[1] for key in by_itself}
-    claim(crept == targets.keys(), f"the targets are {shown(targets)}, but {shown(crept)} moved")
+    claim(crept == targets.keys(), f"the targets are {listed(targets)}, but {listed(crept)} moved")
 
 
 def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **options: Any) -> None:
@@ -206,17 +197,15 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
             torch.manual_seed(seed)
             logs.append({key: value.item() for key, value in algorithm.update(batch(number)).items()})
         claim(logs[0] == logs[1], f"update {number} logs {logs[0]} and {logs[1]}: keep all in parts, draw from draws")
-    here, there = tensors_of(one.state_dict()), tensors_of(other.state_dict())
-    differing = [key for key in here if not torch.equal(here[key], there[key])]
-    claim(differing == [], f"these differ at the end: {shown(differing)}")
+    claim_equal(tensors_of(one.state_dict()), tensors_of(other.state_dict()), "these differ at the end")
 
 
 def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
     """Make an algorithm permute the rows of every batch: the same mathematics, summed in another order."""
 
-    def each(function: Callable[..., Any], given: FeatureBatch, *tensors: Tensor) -> Any:
-        order = torch.randperm(len(given.z), generator=torch.Generator().manual_seed(seed)).to(given.z.device)
-        result = function(given.replace(**{name: given[name][order] for name in given}), *(t[order] for t in tensors))
+    def each(function: Callable[..., Any], data: FeatureBatch, *tensors: Tensor) -> Any:
+        order = torch.randperm(len(data.z), generator=torch.Generator().manual_seed(seed)).to(data.z.device)
+        result = function(data.replace(**{name: data[name][order] for name in data}), *(t[order] for t in tensors))
         return result if isinstance(result, Loss) else result[order.argsort()]
 
     algorithm.each = each  # type: ignore[method-assign, assignment]
@@ -230,15 +219,12 @@ def farther_than_rounding(
 ) -> list[str]:
     """Tensors that differ from a single run's by more than rounding explains, and by how much.
 
-    Args:
-        found: tensors by name.
-        single: repeats a single run and returns its tensors; its argument modifies the algorithm before the first
-            step.
-        times: tolerance, in multiples of the largest change by three other summation orders or float32's epsilon.
+    `single` repeats a single run; its argument modifies the algorithm before the first step. The tolerance is `times`
+    the largest change by three other summation orders or float32's epsilon.
     """
     expected = single(lambda algorithm: algorithm)
     others = [single(lambda algorithm, seed=seed: permuted(algorithm, seed)) for seed in range(3)]  # type: ignore[misc]
-    claim(found.keys() == expected.keys(), f"they have {shown(found)}, a single run {shown(expected)}")
+    claim(found.keys() == expected.keys(), f"they have {listed(found)}, a single run {listed(expected)}")
     far = []
     for name, value in expected.items():
         value = value.double()
@@ -266,9 +252,9 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
     whole = Stack(runs)
     logs = []
     for number in range(updates):
-        given = [batch(seed * updates + number) for seed in seeds]
+        data = [batch(seed * updates + number) for seed in seeds]
         try:
-            logs.append(whole.update(FeatureBatch(**{key: torch.stack([b[key] for b in given]) for key in given[0]})))
+            logs.append(whole.update(FeatureBatch(**{key: torch.stack([b[key] for b in data]) for key in data[0]})))
         except (UserError, RuntimeError) as error:
             claim(False, f"an update of three stacked runs fails: {error}")
     for seed, run in zip(seeds, runs, strict=True):
@@ -280,7 +266,7 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
         whole.settle(seed)
         found = course(run, [{key: value[seed] for key, value in row.items()} for row in logs])
         far = farther_than_rounding(found, single)
-        claim(not far, f"a stacked run differs from a single one: {shown(far)}")
+        claim(not far, f"a stacked run differs from a single one: {listed(far)}")
 
 
 def actions_lie_within_their_bounds(name: str, **options: Any) -> None:
@@ -295,10 +281,9 @@ def actions_lie_within_their_bounds(name: str, **options: Any) -> None:
 
 def a_batch_is_left_as_it_was(name: str, **options: Any) -> None:
     """An update does not modify its batch."""
-    given = batch()
-    make(name, **options).update(given)
-    changed = [f.name for f in fields(FeatureBatch) if not torch.equal(given[f.name], batch()[f.name])]
-    claim(changed == [], f"it changed {shown(changed)}")
+    transitions = batch()
+    make(name, **options).update(transitions)
+    claim_equal(dict(**transitions), dict(**batch()), "it changed")
 
 
 CHECKS: tuple[Check, ...] = (

@@ -29,20 +29,10 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.testing.contract import Check, claim, run_checks
 
 STACKS = 8
-_MODES: tuple[Mode, ...] = get_args(Mode)
 
 
 def check_corruption(name: str, **options: Any) -> None:
-    """Run all checks on a corruption.
-
-    Args:
-        name: name of a stage in `vd4rl_pomdp.corruptions.STAGES`, or several joined by `+`.
-        options: the stages' options.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such stage or option, or an option has the name of a pretraining setting.
-    """
+    """Run all checks on a corruption: a stage of `vd4rl_pomdp.corruptions.STAGES`, or several joined by `+`."""
     CorruptionConfig.of(name, **options)
     PretrainConfig.of("smoke", corruption=name, **options)
     run_checks("corruption", CHECKS, name, **options)
@@ -138,7 +128,7 @@ def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> Non
     """The fast data path equals shifting the stacks and then corrupting them."""
     with TemporaryDirectory() as folder:
         dataset = _random_set(Path(folder))
-        for mode in _MODES:
+        for mode in get_args(Mode):
             for shift in (0, 4):
                 _claim_view(dataset, CorruptionConfig.of(name, mode, **options), shift)
 

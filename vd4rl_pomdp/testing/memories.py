@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -12,10 +10,18 @@ from torch import Tensor
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from vd4rl_pomdp.core.types import Windows, previous
-from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
-from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.memory import Memory, make_memory, run_backward, run_memory
-from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+from vd4rl_pomdp.testing.contract import (
+    Check,
+    claim,
+    claim_close,
+    claim_gradients,
+    reloaded,
+    run_checks,
+    streamed,
+    weighted_sum,
+)
 
 BATCH, ROWS, INPUTS = 3, 6, 5
 _WIDTH = 7
@@ -24,16 +30,7 @@ _METHODS = ({"method": "mik+a"}, {"method": "mik"}, {"method": "mik+a", "m": 2},
 
 
 def check_memory(name: str, **options: Any) -> None:
-    """Run all checks on a memory.
-
-    Args:
-        name: name in `vd4rl_pomdp.nn.memory.MEMORIES`.
-        options: its options.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such memory or option, or an option has the name of a pretraining setting.
-    """
+    """Run all checks on a memory of `vd4rl_pomdp.nn.memory.MEMORIES`."""
     PretrainConfig.of("smoke", history=name, **options)
     run_checks("memory", CHECKS, name, **options)
 
@@ -46,15 +43,15 @@ def make(name: str, **options: Any) -> Memory:
 
 def encoder_of(name: str, **settings: Any) -> Encoder:
     """An encoder with the memory, for observations of three numbers; identical at every call."""
-    told = {"frame_encoder": "flat", "action_target": "mse", "hidden_dim": _WIDTH} | settings
-    config = PretrainConfig.of("smoke", history=name, **told)
+    settings = {"frame_encoder": "flat", "action_target": "mse", "hidden_dim": _WIDTH} | settings
+    config = PretrainConfig.of("smoke", history=name, **settings)
     torch.manual_seed(0)
     return build_objective(config, 2, build_target(config, torch.zeros(1, 2).numpy()), None, (3, 1)).encoder.eval()
 
 
-def rows(batch: int = BATCH) -> Tensor:
-    """Random rows (batch, ROWS, INPUTS); identical at every call."""
-    return torch.randn(batch, ROWS, INPUTS, generator=torch.Generator().manual_seed(0))
+def rows() -> Tensor:
+    """Random rows (BATCH, ROWS, INPUTS); identical at every call."""
+    return torch.randn(BATCH, ROWS, INPUTS, generator=torch.Generator().manual_seed(0))
 
 
 def windows() -> Windows:
@@ -86,10 +83,7 @@ def streaming_equals_batch(name: str, **options: Any) -> None:
     for method in _METHODS:
         encoder, window = encoder_of(name, **method, **options), windows()
         with torch.no_grad():
-            whole, state = encoder.encode(window), encoder.initial_state(BATCH)
-            for t in range(ROWS):
-                z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
-                claim_close(z, whole[:, t], f"they differ at row {t} of {shown(map(str, method.values()))}", 1e-5)
+            claim_close(streamed(encoder, window), encoder.encode(window), f"they differ for {method}", 1e-5)
 
 
 def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
@@ -100,15 +94,14 @@ def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
     # in float64, so that small gradients across many rows do not underflow
     memory, x = make(name, **options).double(), rows().double().requires_grad_()
     out, _ = run_memory(memory, x)
-    weights = torch.randn(out.shape[-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for t in range(ROWS):
-        (gradient,) = torch.autograd.grad((out[1, t] * weights).sum(), x, retain_graph=True)
+        (gradient,) = torch.autograd.grad(weighted_sum(out[1, t]), x, retain_graph=True)
         reached = [tuple(place) for place in torch.nonzero(gradient.abs().amax(2)).tolist()]
         first = max(0, t + 1 - (memory.reach or ROWS))
         past = {(1, row) for row in range(first, t + 1)}
-        told = f"row {t} of window 1 has gradients to (window, row) {reached}"
-        claim(past.issuperset(reached), f"{told}: only rows {first} to {t} of window 1 may have one")
-        claim((1, t) in reached and (t == 0 or len(reached) > 1), f"{told}: itself and an earlier row must have one")
+        found = f"row {t} of window 1 has gradients to (window, row) {reached}"
+        claim(past.issuperset(reached), f"{found}: only rows {first} to {t} of window 1 may have one")
+        claim((1, t) in reached and (t == 0 or len(reached) > 1), f"{found}: itself and an earlier row must have one")
 
 
 def actions_are_read_where_a_method_has_them(name: str, **options: Any) -> None:
@@ -139,9 +132,8 @@ def observations_are_read_where_it_says(name: str, **options: Any) -> None:
                 plain, other = (encoder.from_features(one, window.prev_action) for one in features)
             moved = plain != other
             rows = moved.any(2).any(0).tolist()
-            told = f"o_{row} moves rows {rows} of {method}"
-            claim(not any(rows[:row]), told)
-            claim(all(rows) == (row == 0) and any(rows) == (row == 0) if memory.first_only else rows[row], told)
+            right = rows == [row == 0] * ROWS if memory.first_only else rows[row] and not any(rows[:row])
+            claim(right, f"o_{row} moves rows {rows} of {method}")
 
 
 def padding_is_not_read(name: str, **options: Any) -> None:
@@ -157,22 +149,16 @@ def padding_is_not_read(name: str, **options: Any) -> None:
 def gradients_reach_all_parameters(name: str, **options: Any) -> None:
     """A loss on the outputs has a gradient to every parameter."""
     memory = make(name, **options)
-    out, _ = run_memory(memory, rows())
-    (out * torch.randn(out.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
-    still = [key for key, value in memory.named_parameters() if value.grad is None or not value.grad.any()]
-    claim(still == [], f"none reaches {shown(still)}")
+    weighted_sum(run_memory(memory, rows())[0]).backward()
+    claim_gradients(memory.named_parameters())
 
 
 def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
     """The seed determines the weights; saving and loading an encoder preserves its states."""
     encoder, window = encoder_of(name, **options), windows()
-    with TemporaryDirectory() as folder:
-        save_encoder(Path(folder), encoder, EncoderCard("mik+a", "", "", {"corruption": "none"}, 0, 0, "smoke"))
-        loaded, _ = load_encoder(folder)
-    claim(loaded.config == encoder.config, f"{encoder.config} came back as {loaded.config}")
     with torch.no_grad():
         states = encoder.encode(window)
-        claim_close(loaded.encode(window), states, "its states differ", 1e-5)
+        claim_close(reloaded(encoder).encode(window), states, "its states differ", 1e-5)
         claim_close(encoder_of(name, **options).encode(window), states, "another build differs", 1e-5)
 
 

@@ -18,7 +18,16 @@ from vd4rl_pomdp.corruptions import CORRUPTIONS
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS, CodeOptions, target_options
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
 from vd4rl_pomdp.nn.visibility import declared, dependence, response, wrong_pairs
-from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+from vd4rl_pomdp.testing.contract import (
+    Check,
+    claim,
+    claim_close,
+    claim_equal,
+    claim_gradients,
+    listed,
+    run_checks,
+    streamed,
+)
 
 ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
@@ -30,24 +39,18 @@ _PICTURE, _GRID = (9, 84), (9, 2)
 
 
 def check_method(name: str, **settings: Any) -> None:
-    """Run all checks on a method.
+    """Run all checks on a method of `pretrain.objectives.METHODS`.
 
-    Args:
-        name: name in `pretrain.objectives.METHODS`.
-        settings: settings of `vd4rl-pomdp pretrain`: the method's options, `history`, `frame_encoder`, ...
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such method or setting, or two chosen parts have an option of the same name.
+    `settings` are those of `vd4rl-pomdp pretrain`: the method's options, `history`, `frame_encoder`, ...
     """
     PretrainConfig.of("smoke", **({"method": name, "corruption": CORRUPTIONS[-1]} | settings))
     run_checks("method", checks_of(name, **settings), name, **settings)
 
 
 def checks_of(name: str, **settings: Any) -> tuple[Check, ...]:
-    """Checks for a method: ENCODING for all, TRAINED if it is trained, INVERSE if it predicts actions."""
+    """Checks for a method: more of them if it is trained, and if it predicts actions."""
     trained = TRAINED if METHODS.named(name).trained else ()
-    return ENCODING + trained + (INVERSE if predicts_actions(name, **settings) else ())
+    return (streaming_equals_batch, *trained, *(INVERSE if predicts_actions(name, **settings) else ()))
 
 
 def predicts_actions(name: str, **settings: Any) -> bool:
@@ -104,13 +107,9 @@ def streaming_equals_batch(name: str, **settings: Any) -> None:
     window = batch((ROWS, ROWS), state=METHODS.named(name).reads_state)
     with torch.no_grad():
         whole = encoder.encode(window)
-        state, rows = encoder.initial_state(2), []
-        for t in range(ROWS):
-            z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
-            rows.append(z)
     shape = (2, ROWS, encoder.dim)
     claim(whole.shape == shape, f"windows are encoded as {tuple(whole.shape)}, not {shape}")
-    claim_close(torch.stack(rows, 1), whole, "the two differ", 1e-5)
+    claim_close(streamed(encoder, window), whole, "the two differ", 1e-5)
 
 
 def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
@@ -121,7 +120,7 @@ def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
     for key, value in logs.items():
         claim(value.numel() == 1, f"{key} is logged with shape {tuple(value.shape)}")
         claim(not value.requires_grad, f"{key} is logged with its graph: detach it")
-    claim("loss" in logs, f"no `loss` is logged, only {shown(logs)}")
+    claim("loss" in logs, f"no `loss` is logged, only {listed(logs)}")
     claim(torch.equal(logs["loss"], loss.detach()), f"{logs['loss'].item()} is logged, the loss is {loss.item()}")
 
 
@@ -129,8 +128,7 @@ def a_loss_moves_the_whole_encoder(name: str, **settings: Any) -> None:
     """The loss has a gradient to every parameter of the encoder."""
     objective = build(name, **settings)
     objective.loss(windows(name), 0.0)[0].backward()
-    still = [n for n, p in objective.encoder.named_parameters() if p.grad is None or not p.grad.any()]
-    claim(still == [], f"none reaches {shown(still)}")
+    claim_gradients(objective.encoder.named_parameters())
 
 
 def steps_lower_the_loss(name: str, **settings: Any) -> None:
@@ -159,7 +157,11 @@ def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings
     here = build(name, **settings)
     optimiser = torch.optim.Adam(here.parameters(), lr=1e-3)
     _train(name, here, optimiser, range(2))
-    there = _elsewhere(name, here, **settings)
+    there = build(name, **settings)
+    with torch.no_grad():
+        for parameter in there.parameters():
+            parameter.add_(0.1)  # else parameters missing from the state_dict would match by the equal seed
+    there.load_state_dict(copy.deepcopy(here.state_dict()))
     other = torch.optim.Adam(there.parameters(), lr=1e-3)
     other.load_state_dict(copy.deepcopy(optimiser.state_dict()))
     torch.manual_seed(1)
@@ -171,19 +173,7 @@ def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings
         f"the losses are {losses} and {again}: keep what the loss reads as parameters or buffers, "
         "draw from nn.draws.Draws",
     )
-    state = there.state_dict()
-    differing = [key for key, value in here.state_dict().items() if not torch.equal(value, state[key])]
-    claim(differing == [], f"these differ at the end: {shown(differing)}")
-
-
-def _elsewhere(name: str, objective: Objective, **settings: Any) -> Objective:
-    """A new objective with the state_dict of the given one."""
-    other = build(name, **settings)
-    with torch.no_grad():
-        for parameter in other.parameters():
-            parameter.add_(0.1)  # else parameters missing from the state_dict would match by the equal seed
-    other.load_state_dict(copy.deepcopy(objective.state_dict()))
-    return other
+    claim_equal(here.state_dict(), there.state_dict(), "these differ at the end")
 
 
 def padding_changes_no_loss(name: str, **settings: Any) -> None:
@@ -202,8 +192,8 @@ def every_action_target_is_taken(name: str, **settings: Any) -> None:
     for target in ACTION_TARGETS:
         read = {field.name for field in fields(target_options(target))}
         unread = {field.name for field in fields(CodeOptions)} - read
-        told = {name: value for name, value in settings.items() if name not in unread}
-        loss, _ = build(name, **(told | {"action_target": target})).loss(batch(), 0.0)
+        chosen = {name: value for name, value in settings.items() if name not in unread} | {"action_target": target}
+        loss, _ = build(name, **chosen).loss(batch(), 0.0)
         claim(torch.isfinite(loss), f"with {target} it is {loss.item()}")
 
 
@@ -219,8 +209,8 @@ def optional_terms_are_added(name: str, **settings: Any) -> None:
     expected = plain.loss(batch(), 0.25)[0] + 0.5 * logs["self_prediction"] + 0.1 * 0.75 * logs["l2_states"]
     claim_close(loss.detach(), expected.detach(), "the loss with these terms is not the loss without, plus the terms")
     claim(rich.head.k is None, "--no-k-embedding leaves k in the head")
-    told = cast(InverseObjective, build(name, **(settings | {"k_embedding": True})))
-    claim(told.head.k is not None, "--k-embedding gives the head no k")
+    with_k = cast(InverseObjective, build(name, **(settings | {"k_embedding": True})))
+    claim(with_k.head.k is not None, "--k-embedding gives the head no k")
 
 
 def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: Any) -> None:
@@ -259,12 +249,10 @@ def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int)
             "is declared to see": declared(objective, t, k, lengths[b], b == 0, frames),
         }
         what = "frames" if frames else "rows"
-        told = "; ".join(f"{how} {what} {sorted(o)} and actions {sorted(a)}" for how, (o, a) in found.items())
-        raise AssertionError(f"the prediction of a_{t} from rows {t} and {t + k} {told} ({len(wrong)} pairs are wrong)")
+        seen = "; ".join(f"{how} {what} {sorted(o)} and actions {sorted(a)}" for how, (o, a) in found.items())
+        raise AssertionError(f"the prediction of a_{t} from rows {t} and {t + k} {seen} ({len(wrong)} pairs are wrong)")
 
 
-ENCODING: tuple[Check, ...] = (streaming_equals_batch,)
-"""For all methods."""
 TRAINED: tuple[Check, ...] = (
     a_loss_is_a_finite_scalar,
     a_loss_moves_the_whole_encoder,

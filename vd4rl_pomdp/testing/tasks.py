@@ -18,14 +18,9 @@ DECISIONS = 12
 
 
 def check_task(name: str) -> None:
-    """Run all checks on a task by playing a few short episodes.
+    """Run all checks on a task of `vd4rl_pomdp.core.tasks.TASKS` by playing a few short episodes.
 
-    Args:
-        name: name in `vd4rl_pomdp.core.tasks.TASKS`.
-
-    Raises:
-        AssertionError: a promise is broken; the message says which and how.
-        UserError: there is no such task, or its environment cannot be built or returns no images or numeric rewards.
+    UserError also if its environment cannot be built or returns no images or numeric rewards.
     """
     TASKS.named(name)
     run_checks("task", CHECKS, name)
@@ -91,10 +86,7 @@ def rows_have_the_declared_widths(name: str) -> None:
     width = rows[0].physics.size
     for row in rows:
         claim(row.frame is None, "a frame is rendered that was not requested")
-        claim(
-            (row.state.shape, row.state.dtype) == ((found.state_dim,), np.float32),
-            f"a state is {row.state!r}",
-        )
+        claim((row.state.shape, row.state.dtype) == ((found.state_dim,), np.float32), f"a state is {row.state!r}")
         claim((row.physics.shape, row.physics.dtype) == ((width,), np.float64), f"a simulator state is {row.physics!r}")
         claim(np.isfinite(row.reward), f"a reward is {row.reward}")
 
@@ -117,29 +109,32 @@ def actions_fill_their_bounds(name: str) -> None:
     for action in (-1.0, -0.7, 0.0, 0.3, 1.0):
         env = make(name)
         env.reset(0)
-        low, high, given = _given(env, np.full(env.action_dim, action, np.float32))
+        low, high, received = _received(env, np.full(env.action_dim, action, np.float32))
         least, most = high if action == 1 else low, low if action == -1 else high
-        claim(((least <= given) & (given <= most)).all(), f"{action} becomes {given}, the bounds are {low} and {high}")
-        claim(given.dtype == low.dtype, f"actions are {given.dtype}, its bounds {low.dtype}")
+        claim(
+            ((least <= received) & (received <= most)).all(),
+            f"{action} becomes {received}, the bounds are {low} and {high}",
+        )
+        claim(received.dtype == low.dtype, f"actions are {received.dtype}, its bounds {low.dtype}")
 
 
-def _given(env: PixelEnv, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _received(env: PixelEnv, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Take one step; returns the environment's action bounds (low, high) and the action it received, each (A,)."""
     inner: Any = env.env if isinstance(env.task, GymnasiumTask) else env.simulator  # type: ignore[attr-defined]
-    given: list[np.ndarray] = []
+    received: list[np.ndarray] = []
     step = inner.step
 
     def watched(action: np.ndarray) -> Any:
-        given.append(action)
+        received.append(action)
         return step(action)
 
     inner.step = watched
     env.step(action)
     if isinstance(env.task, GymnasiumTask):
         space = inner.action_space
-        return space.low.ravel(), space.high.ravel(), given[0].ravel()
+        return space.low.ravel(), space.high.ravel(), received[0].ravel()
     spec = inner.action_spec()
-    return spec.minimum, spec.maximum, given[0]
+    return spec.minimum, spec.maximum, received[0]
 
 
 def rewards_replay(name: str) -> None:

@@ -84,11 +84,10 @@ class Integrator(GRU):
         return next(self.parameters()).new_zeros(self.num_layers, batch, self.hidden_size + 1 + self.features)
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        """See `Memory`."""
         hidden, count, first = state.split([self.hidden_size, 1, self.features], dim=2)
         t = count[0] + torch.arange(rows.shape[1], device=rows.device)  # (B, T)
         first = torch.where(count[0] > 0, first[0], rows[:, 0, : self.features])
-        told = first[:, None].expand(-1, rows.shape[1], -1), rows[..., self.features :], t.log1p()[..., None]
-        out, hidden = super().forward(torch.cat(told, dim=2), hidden.contiguous())
+        inputs = first[:, None].expand(-1, rows.shape[1], -1), rows[..., self.features :], t.log1p()[..., None]
+        out, hidden = super().forward(torch.cat(inputs, dim=2), hidden.contiguous())
         after = torch.cat([t[:, -1:] + 1, first], dim=1).expand(len(hidden), -1, -1)
         return out, torch.cat([hidden, after], dim=2)

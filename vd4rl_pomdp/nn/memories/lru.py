@@ -46,7 +46,6 @@ class LRUOptions(MemoryOptions):
     }
 
     def check(self) -> None:
-        """Raise UserError for invalid values."""
         super().check()
         if self.r_min >= self.r_max:
             raise UserError(f"--r-min is {self.r_min}, --r-max {self.r_max}: choose a greater --r-max")
@@ -73,15 +72,14 @@ class LRU(Memory):
         return self.nu.new_zeros(len(self.nu), batch, 2 * self.nu.shape[1])
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Memory`."""
         decays = torch.polar((-self.nu.exp()).exp(), self.theta.exp())
         scales = self.gamma.exp()[..., None]
-        x, kept = self.read(rows), []
+        x, states = self.read(rows), []
         before = torch.view_as_complex(state.unflatten(2, (-1, 2)))
         for layer, decay, scale, h in zip(self.layers, decays, scales, before, strict=True):
             x, after = layer(x, decay, scale, h)
-            kept.append(after)
-        return self.norm(x), torch.stack(kept)
+            states.append(after)
+        return self.norm(x), torch.stack(states)
 
 
 class _Layer(nn.Module):
@@ -105,16 +103,10 @@ class _Layer(nn.Module):
 
 
 def scan(decay: Tensor, inputs: Tensor, before: Tensor) -> Tensor:
-    """Parallel scan of h_t = decay h_{t-1} + inputs_t (Hillis and Steele 1986).
+    """Parallel scan of h_t = decay h_{t-1} + inputs_t (Hillis and Steele 1986): (B, T, N) complex.
 
-    Args:
-        decay: (N,) complex, inside the unit circle.
-        inputs: (B, T, N) complex.
-        before: (B, N) complex, h before the first row.
-
-    Returns:
-        (B, T, N). Each of log2(T) steps doubles the span that is summed. It never divides by powers of decay, so it is
-        as stable as the sequential recurrence.
+    From decay (N,), inputs (B, T, N) and h before the first row (B, N). Each of log2(T) steps doubles the span that is
+    summed. It never divides by powers of decay, so it is as stable as the sequential recurrence.
     """
     first = (inputs[:, 0] + decay * before)[:, None]
     h = torch.cat([first, inputs[:, 1:]], dim=1) if inputs.shape[1] > 1 else first

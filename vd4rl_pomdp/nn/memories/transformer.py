@@ -60,18 +60,17 @@ class Transformer(Memory):
         return self.bias.new_zeros(1, batch, sum(self._sizes))
 
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Memory`."""
         batch, count, _ = rows.shape
         there, *pasts = state[0].split(self._sizes, dim=1)
         there = torch.cat([there, there.new_ones(batch, count)], dim=1)
         # queries in blocks of at most `window` rows: the cost per row does not grow with the episode's length
         size = min(count, self.window)
         masks = self._biases(size)[:, None] + ((_blocks(there, size, self.window) - 1) * -_NEVER)[:, None, None]
-        x, kept = self.read(rows), [there[:, count:]]
+        x, state_parts = self.read(rows), [there[:, count:]]
         for layer, past, mask in zip(self.layers, pasts, masks.unbind(), strict=True):
             x, seen = layer(x, past.view(batch, self.window - 1, -1), mask, size)
-            kept.append(seen[:, count:].flatten(1))
-        return self.norm(x), torch.cat(kept, dim=1)[None]
+            state_parts.append(seen[:, count:].flatten(1))
+        return self.norm(x), torch.cat(state_parts, dim=1)[None]
 
     def _biases(self, size: int) -> Tensor:
         """(L, heads, size, window - 1 + size): biases between a block's queries and the keys it may read."""
