@@ -42,7 +42,6 @@ from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 
 LISTING = "vd4rl_pomdp.json"
-"""File name of the listing."""
 ENCODER, AGENT, SET = "an encoder", "an agent", "a data set"
 """Kinds of repository, named as by `runs.outputs.kept_in`."""
 _FORMAT = 1

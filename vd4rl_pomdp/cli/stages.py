@@ -120,6 +120,8 @@ def evaluate(words: list[str], program: str) -> None:
     if config.keep and has_rows:
         refuse_kept(run, another(trained, config.corruption or "", options)[1])
     rows, played = evaluate_run(run, config.corruption, config.episodes, config.workers, **options)
+    if config.keep:
+        refuse_kept(run, rows[0]["evaluated_under"])  # again: another process may have kept the same meanwhile
     for file in [*([out] if out else []), *([run / EPISODES_FILE] if config.keep else [])]:
         append_episodes(file, rows)
     reference = Reference.read(run)
@@ -143,7 +145,7 @@ def list_parts() -> None:
     import vd4rl_pomdp.data.formats  # noqa: F401
 
     for setting, registry in sorted(REGISTRIES.items()):
-        print(f"{flag_of(setting)}   (packages offer theirs as entry points of {registry.group})")
+        print(f"{flag_of(setting)}   (entry point group {registry.group})")
         width = max(map(len, [*registry, *registry.broken]))
         for name, part in registry.items():
             origin = f"   [{registry.origin(name)}]" if registry.origin(name) else ""

@@ -21,10 +21,8 @@ from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import certificates_of
 
-FILE = "comparison"
-"""Base name of its files, by which a comparison's folder is recognised."""
-Conditions = dict[tuple, list[Run]]
-"""Finished runs by the values of CONDITION."""
+FILE = "comparison"  # base name of its files, by which a comparison's folder is recognised
+Conditions = dict[tuple, list[Run]]  # finished runs by the values of CONDITION
 
 
 class SideBySide(NamedTuple):

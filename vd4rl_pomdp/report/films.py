@@ -15,12 +15,9 @@ from vd4rl_pomdp.report.load import CONDITION, Run, title
 from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.files import Row
 
-FILM = {"clean": 4, "corrupted": 4, "return": 1}
-"""Arrays of a film and their number of dimensions."""
-STRIP_FRAMES = 8
-"""Maximum frames in a film strip."""
-MOST_BYTES = 5 * 2**20
-"""Maximum size of all films in a page, in base64; further films are left out."""
+FILM = {"clean": 4, "corrupted": 4, "return": 1}  # arrays of a film and their number of dimensions
+STRIP_FRAMES = 8  # maximum frames in a film strip
+MOST_BYTES = 5 * 2**20  # maximum size of all films in a page, in base64; further films are left out
 Film = dict[str, np.ndarray]
 
 
@@ -85,6 +82,8 @@ def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
     frames = []
     for shot in range(max(len(film["clean"]) for film in films)):
         rows = [_row(name, film, min(shot, len(film["clean"]) - 1)) for name, film in zip(names, films, strict=True)]
+        wide = max(row.shape[1] for row in rows)  # agents may see frames of different sizes
+        rows = [np.pad(row, ((0, 0), (0, wide - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
         frames.append(Image.fromarray(np.concatenate(rows)))
     return _webp(frames, 70)
 

@@ -20,7 +20,6 @@ from vd4rl_pomdp.report.render import render
 from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
 
 Study = dict[str, Any]
-"""Return value of `studies.theory.theory_study`."""
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
 LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}

@@ -23,8 +23,7 @@ from vd4rl_pomdp.runs.files import synchronise, write_bytes
 
 KEPT = 2
 """Checkpoints to keep. If the newest is damaged, only the steps since the one before are lost."""
-State = dict[str, Any]
-"""Nested dicts, lists and tuples of tensors, numbers, strings and None."""
+State = dict[str, Any]  # nested dicts, lists and tuples of tensors, numbers, strings and None
 
 
 class Checkpoints:

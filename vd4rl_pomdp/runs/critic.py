@@ -8,14 +8,12 @@ import numpy as np
 
 from vd4rl_pomdp.runs.metrics import Metrics
 
-VALUE = "q"
-"""Name under which algorithms log the critic's mean value over a batch."""
+VALUE = "q"  # name under which algorithms log the critic's mean value over a batch
 TOLD = {"value", "moved", "data"}
 """Keys of critic.json for an algorithm with a critic; for others it is empty."""
 CONVERGED = 0.02
 """A critic has converged if its value moved by less than this fraction over the last fifth of the updates."""
-FEWEST = 3
-"""Minimum number of rows for the line fit: two points always fit."""
+FEWEST = 3  # minimum number of rows for the line fit: two points always fit
 
 
 def critic_of(

@@ -16,8 +16,7 @@ from typing import IO, Any, TypeVar
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 
-Row = dict[str, Any]
-"""One row of a table: values by column."""
+Row = dict[str, Any]  # one row of a table: values by column
 Member = TypeVar("Member")
 Key = TypeVar("Key", bound=Hashable)
 

@@ -18,8 +18,7 @@ from vd4rl_pomdp.runs.run import RunFolder
 class Learner(Protocol):
     """What a loop trains."""
 
-    step: int
-    """Steps done so far."""
+    step: int  # steps done so far
 
     def state(self) -> State:
         """Everything needed to resume bit-identically."""
@@ -53,7 +52,6 @@ class Loop:
         return self._learner.step % every == 0 or self._learner.step == self._total
 
     def add(self, logs: dict[str, Tensor]) -> None:
-        """Add the scalars of the step just done to the next row of metrics."""
         self._means.add(logs)
 
     def log(self, *shown: str, **more: float) -> None:
@@ -70,7 +68,6 @@ class Loop:
         self._log.write(self._learner.step, row)
 
     def show(self, **numbers: float) -> None:
-        """Show numbers in the progress line."""
         self._progress.advance(0, **numbers)
 
     def require_finite(self, module: nn.Module) -> None:

@@ -27,17 +27,13 @@ from vd4rl_pomdp.runs.files import appending, write_bytes
 from vd4rl_pomdp.runs.run import RunFolder, recipe
 
 WandbMode = Literal["off", "offline", "online"]
-EVALUATION = "eval/"
-"""Prefix of an evaluation's metrics: eval/return/CORRUPTION, eval/score/CORRUPTION."""
+EVALUATION = "eval/"  # prefix of an evaluation's metrics: eval/return/CORRUPTION, eval/score/CORRUPTION
 PROJECT = "vd4rl-pomdp"
 INIT_TIMEOUT_S, FINISH_TIMEOUT_S = 30.0, 60.0
 """Seconds that wandb may wait for its server before the first row and after the last one."""
-LONGEST = {"name": 128, "group": 128, "tags": 64}
-"""Maximum lengths that wandb accepts, in characters."""
-_MOST_ADDED = 1024
-"""Steps buffered before their scalars are summed."""
-Metrics = Mapping[str, float]
-"""One row: `step`, and numbers by name."""
+LONGEST = {"name": 128, "group": 128, "tags": 64}  # maximum lengths that wandb accepts, in characters
+_MOST_ADDED = 1024  # steps buffered before their scalars are summed
+Metrics = Mapping[str, float]  # one row: `step`, and numbers by name
 
 
 class Means:
@@ -80,19 +76,16 @@ class Means:
         self._added = []
 
     def take(self) -> dict[str, float]:
-        """Return the means and reset."""
         self._sum()
         means = {name: float(total) / steps for name, (total, steps) in self._sums.items()}
         self._sums = {}
         return means
 
     def state_dict(self) -> dict[str, tuple[Tensor, int]]:
-        """State for `load_state_dict`."""
         self._sum()
         return dict(self._sums)
 
     def load_state_dict(self, state: dict[str, tuple[Tensor, int]]) -> None:
-        """Resume from `state_dict`."""
         self._sums, self._added = {name: (total, steps) for name, (total, steps) in state.items()}, []
 
 
@@ -131,7 +124,6 @@ class MetricsLog:
             self._try(name, mirror.write, row)
 
     def close(self) -> None:
-        """Close the mirrors."""
         for name, mirror in list(self._mirrors.items()):
             self._try(name, mirror.close)
 
@@ -212,11 +204,9 @@ class Wandb:
                 self.write(row)
 
     def write(self, row: Metrics) -> None:
-        """Log a row."""
         self._run.log(dict(row))
 
     def close(self) -> None:
-        """Upload what is left."""
         self._run.finish()
 
 
@@ -252,7 +242,6 @@ class TensorBoard:
             self.write(row)
 
     def write(self, row: Metrics) -> None:
-        """Append and flush a row."""
         for name, value in row.items():
             if name != "step":
                 summary = self._scalar(name, value)
@@ -260,5 +249,4 @@ class TensorBoard:
         self._writer.flush()
 
     def close(self) -> None:
-        """Close the file."""
         self._writer.close()

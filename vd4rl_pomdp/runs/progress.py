@@ -41,11 +41,9 @@ class ProgressLine:
         self._task = self._bar.add_task(title, total=total, completed=start, speed="", note="")
         self._note = ""
         self._clock, self._first = clock, (start, clock())
-        self._plain = self._first
-        """Progress and time at the last plain line."""
+        self._plain = self._first  # progress and time at the last plain line
 
     def advance(self, amount: int = 1, **numbers: float) -> None:
-        """Advance by `amount`, and show `numbers` if given."""
         self._done += amount
         self._bar.advance(self._task, amount)
         if numbers:

@@ -24,10 +24,8 @@ Logs = dict[str, Tensor]
 Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
 """Takes a function without running it; returns a function that replays it, and the tensor that then holds its
 result."""
-EAGER_VARIABLE = "VD4RL_POMDP_EAGER"
-"""If set to 1, no step is replayed."""
-WARM_UP = 3
-"""Eager steps per turn before capture: libraries pick kernels and optimisers create their state."""
+EAGER_VARIABLE = "VD4RL_POMDP_EAGER"  # if set to 1, no step is replayed
+WARM_UP = 3  # eager steps per turn before capture: libraries pick kernels and optimisers create their state
 
 
 class Replay:

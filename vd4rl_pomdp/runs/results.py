@@ -51,32 +51,23 @@ NOT_CERTIFIED = "not certified"
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
 DAMAGED = "its files are damaged", "take another copy, or leave it out"
 """Message for a run whose files do not hold what a run writes."""
-_ROUNDING = 1e-4
-"""Tolerance of a score; scores and returns are stored with four decimals."""
+_ROUNDING = 1e-4  # tolerance of a score; scores and returns are stored with four decimals
 
 
 @dataclass(frozen=True)
 class Result:
     """One run, finished or not, from its own folder or a results folder."""
 
-    id: str
-    """Hash of what the run computes, see `runs.run.identity`."""
-    path: Path
-    """Its folder, or the results folder that lists it."""
-    files: dict[str, dict[str, Any]]
-    """Contents of those FILES that it has."""
-    step: int
-    """Last step in its metrics; 0 if there are none."""
-    losses: list[tuple[int, float]]
-    """Step and action loss over a pretraining."""
-    rows: list[Row]
-    """Evaluation rows, one per episode."""
-    folder: bool = False
-    """Whether `path` is its own folder."""
+    id: str  # hash of what the run computes, see `runs.run.identity`
+    path: Path  # its folder, or the results folder that lists it
+    files: dict[str, dict[str, Any]]  # contents of those FILES that it has
+    step: int  # last step in its metrics; 0 if there are none
+    losses: list[tuple[int, float]]  # step and action loss over a pretraining
+    rows: list[Row]  # evaluation rows, one per episode
+    folder: bool = False  # whether `path` is its own folder
 
     @property
     def place(self) -> str:
-        """Where it is stored, for messages."""
         return str(self.path) if self.folder else f"{self.path}: run {self.id}"
 
     @property
@@ -150,7 +141,6 @@ class Result:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has finished."""
         return "timing" in self.files
 
     @property
@@ -415,8 +405,7 @@ def _contradictions(run: Result) -> Iterator[str]:
         gamma = config.get("gamma", 1)
         if None not in (data, mean) and gamma < 1 and abs(data - mean / (1 - gamma)) > _ROUNDING:
             yield f"its critic tells of data worth {data}, their mean reward {mean} makes {mean / (1 - gamma):.4f}"
-        if run.rows:
-            yield from _astray(run)
+        yield from _astray(run)
 
 
 def _astray(run: Result) -> Iterator[str]:
@@ -436,10 +425,10 @@ def _astray(run: Result) -> Iterator[str]:
         judged = [(step, under) for step, under in played if run.finished or step <= end]
         wanted |= {(step, under): 0 for step, under in judged if step != last or under == own}
         wanted |= {(step, own): count for step in {*range(every, end + 1, every), *[last] * run.finished}}
-        if run.finished and config.get("eval_clean") and own != "none":
+        if run.finished and config.get("eval_clean") and own != "none" and count:
             wanted[last, "none"] = config.get("eval_clean_episodes") or count
     for (step, under), count in sorted(wanted.items()):
-        numbers = sorted(played.get((step, under), []))
+        numbers = played.get((step, under), [])
         if numbers != list(range(count)):
             yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
     task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})

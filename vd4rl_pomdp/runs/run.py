@@ -168,7 +168,6 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has finished."""
         return (self.path / TIMING_FILE).exists()
 
     @property
@@ -191,7 +190,6 @@ class RunFolder:
         self._before = seconds or 0.0
 
     def save(self, step: int, state: State) -> None:
-        """Save the state after a step as the newest checkpoint."""
         self._checkpoints.add(step, state, self.seconds)
 
     def mark_diverged(self, step: int, message: str) -> None:

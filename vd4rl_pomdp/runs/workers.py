@@ -51,8 +51,7 @@ class _Pool:
         self._executor.shutdown(cancel_futures=True)
 
 
-_idle: list[_Pool] = []
-"""At most one pool."""
+_idle: list[_Pool] = []  # at most one pool
 _keeping = False
 
 

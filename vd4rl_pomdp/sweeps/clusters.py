@@ -26,12 +26,9 @@ from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, say
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
-LOOK_S = 15.0
-"""Seconds between polls of the cluster."""
-ANSWER_S = 30.0
-"""Timeout of a command to the cluster, seconds."""
-VAIN = 3
-"""Resubmissions without any progress before the sweep gives up."""
+LOOK_S = 15.0  # seconds between polls of the cluster
+ANSWER_S = 30.0  # timeout of a command to the cluster, seconds
+VAIN = 3  # resubmissions without any progress before the sweep gives up
 
 
 @dataclass(frozen=True)
@@ -39,11 +36,9 @@ class ClusterTask:
     """What runs on a node: a driver that helps with a sweep."""
 
     out: Path
-    plan: str
-    """Name of the plan; empty: all plans in the folder."""
+    plan: str  # name of the plan; empty: all plans in the folder
     options: LocalOptions
-    cwd: str
-    """Working directory, to which relative paths refer."""
+    cwd: str  # working directory, to which relative paths refer
 
     def __call__(self) -> None:
         """Run unclaimed jobs until none is left. SIGTERM and SIGUSR2 (Slurm's warning) end it gracefully."""
@@ -136,7 +131,6 @@ class SlurmCluster:
         return len(self._ask("squeue", "--array", "--noheader", "--format=%T").split())
 
     def submit(self, task: ClusterTask, number: int) -> None:
-        """Submit one array; UserError if Slurm rejects it."""
         try:
             with disk_errors(self.folder):
                 self._executor.submit_array([task] * number)
@@ -242,7 +236,6 @@ class RayCluster:
         return len(self._running)
 
     def submit(self, task: ClusterTask, number: int) -> None:
-        """Submit tasks; Ray places them on nodes."""
         run = self._ray.remote(max_retries=0)(lambda: task())  # retries are decided from the sweep's attempt log
         run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
         self._running += [run.remote() for _ in range(number)]

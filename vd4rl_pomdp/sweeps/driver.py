@@ -40,12 +40,9 @@ from vd4rl_pomdp.sweeps.options import JOB_VARIABLE, LocalOptions
 from vd4rl_pomdp.sweeps.plan import Job
 
 POLL_S = 0.5
-PAUSE_S = 60.0
-"""Seconds to wait before a retry, whichever driver made the last attempt."""
-IN_USE_S = 10.0
-"""Seconds before checking again on a job that another driver is running."""
-IDLE_S = 90.0
-"""Seconds after which a helping driver with nothing to start exits."""
+PAUSE_S = 60.0  # seconds to wait before a retry, whichever driver made the last attempt
+IN_USE_S = 10.0  # seconds before checking again on a job that another driver is running
+IDLE_S = 90.0  # seconds after which a helping driver with nothing to start exits
 PATIENCE_S = 120.0
 """Seconds between SIGTERM and SIGKILL, in which a job finishes its step and writes a checkpoint."""
 _ROOT = Path(__file__).parents[2]
@@ -56,20 +53,17 @@ class Place:
     """Cores and GPU of one job."""
 
     cores: tuple[int, ...]
-    gpu: str | None
-    """Value for CUDA_VISIBLE_DEVICES."""
+    gpu: str | None  # value for CUDA_VISIBLE_DEVICES
 
 
 @dataclass(frozen=True)
 class _Running:
-    jobs: list[Job]
-    """More than one: a stack."""
+    jobs: list[Job]  # more than one: a stack
     places: list[Place]
     process: subprocess.Popen
     began: float
     log: Path
-    log_size: int
-    """Size of the log in bytes before this attempt."""
+    log_size: int  # size of the log in bytes before this attempt
 
 
 class Driver:
@@ -85,8 +79,7 @@ class Driver:
         self._running: list[_Running] = []
         self._not_before: dict[str, float] = {}
         """Earliest time to look at a job again that another driver runs or that just failed."""
-        self._busy = time.monotonic()
-        """Time at which something last ran."""
+        self._busy = time.monotonic()  # time at which something last ran
         self._widths: dict[str, int | None] = {}
         """Feature width by fine-tuning job, known once its encoder exists."""
 
@@ -206,7 +199,6 @@ class Driver:
             self._end(one.jobs, cause, time.monotonic() - one.began, line)
 
     def _end(self, jobs: list[Job], cause: str, seconds: float, line: str) -> None:
-        """Record and print the result of an attempt."""
         shared: Row = {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "host": socket.gethostname()}
         shared |= {"log": str(self._log(jobs[0]).relative_to(self._folder.out))}
         shared |= {"stack": len(jobs)} if len(jobs) > 1 else {}

@@ -34,13 +34,10 @@ DONE, INTERRUPTED, KILLED, UNAVAILABLE, FAILED = "done", "interrupted", "killed"
 """How an attempt at a job ended."""
 PASSING = (KILLED, UNAVAILABLE)
 """Transient causes, worth a retry. Bad input, a bug or a divergence would only recur."""
-TRIES = 5
-"""Consecutive transient failures after which a job counts as failed."""
-_RETRIED = "retried"
-"""Cause of the row that clears a job's earlier failures."""
+TRIES = 5  # consecutive transient failures after which a job counts as failed
+_RETRIED = "retried"  # cause of the row that clears a job's earlier failures
 RUNNING, WAITING, BLOCKED = "running", "waiting", "blocked"
-_RATE_S = 3600.0
-"""Window in seconds over which the rate of finished jobs is measured."""
+_RATE_S = 3600.0  # window in seconds over which the rate of finished jobs is measured
 
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
@@ -54,10 +51,8 @@ class Plan:
     """Jobs, and how to start their processes."""
 
     jobs: list[Job]
-    made_in: Path
-    """Working directory of every job, to which relative paths refer."""
-    out: Path
-    """The sweep's folder, as the jobs' commands name it."""
+    made_in: Path  # working directory of every job, to which relative paths refer
+    out: Path  # the sweep's folder, as the jobs' commands name it
     program: list[str]
     """Arguments of `python` instead of `-m vd4rl_pomdp`: the user's own file that registers plug-ins."""
 
@@ -66,10 +61,8 @@ class SweepFolder:
     """The files of a sweep below its folder."""
 
     def __init__(self, out: Path) -> None:
-        """Creates nothing on disk."""
         self.out = out
-        self.path = out / "sweep"
-        """Folder of the sweep's own files."""
+        self.path = out / "sweep"  # folder of the sweep's own files
         self._attempts = self.path / "attempts.jsonl"
 
     def keep_plan(self, name: str, jobs: Iterable[Job], program: Iterable[str] = ()) -> Plan:
@@ -128,7 +121,6 @@ class SweepFolder:
                     raise DiskFullError(f"{self._attempts}: the disk is full")
 
     def forget(self, job: str) -> None:
-        """Clear the job's failures, so that it is tried again."""
         self.add({"job": job, "cause": _RETRIED})
 
     def attempts(self, jobs: Iterable[Job]) -> dict[str, list[Row]]:

@@ -43,27 +43,22 @@ from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.runs.interrupt import Terminated
 
 GRIDS = Path(__file__).with_name("grids")
-"""The grids that ship with the package."""
 PIXELS = ("collect", "pretrain", "finetune")
 MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
-SHARED = ("seed", "preset")
-"""Settings outside the sections."""
+SHARED = ("seed", "preset")  # settings outside the sections
 _SETS = ("collect", "navigation_collect")
 _TRAININGS = ("pretrain", "finetune", "navigation_train")
-_FOLDERS = {"out", "data", "encoder"}
-"""Settings that the sweep itself fills in."""
+_FOLDERS = {"out", "data", "encoder"}  # settings that the sweep itself fills in
 Values = dict[str, Any]
-Sections = dict[str, Values]
-"""Settings by section; those of SHARED are under ""."""
+Sections = dict[str, Values]  # settings by section; those of SHARED are under ""
 
 
 @dataclass(frozen=True)
 class GridCell:
     """One point of a grid: a dataset, plus the encoder and policy trained on it if the grid has these sections."""
 
-    sections: Sections
-    """Settings, one value each."""
+    sections: Sections  # settings, one value each
     named: Mapping[str, Sequence[str]]
     """By section, settings that distinguish this cell within its grid and so appear in folder names: axes, a block's
     own settings and, for datasets, those set by a `where`."""
@@ -75,12 +70,10 @@ class GridCell:
 
     @property
     def shared(self) -> Values:
-        """Values of SHARED that the grid sets."""
         return self.sections[""]
 
     @property
     def seed(self) -> int:
-        """Seed of its trainings."""
         return self.shared.get("seed", 0)
 
     def value(self, name: str) -> Any:
@@ -95,8 +88,7 @@ class GridCell:
 class Where:
     """A [[where]] table: overrides for the cells that match its conditions."""
 
-    only: list[str]
-    """Conditions, as in `narrow`."""
+    only: list[str]  # conditions, as in `narrow`
     sections: Sections
 
     def applied(self, cell: GridCell, last: Sections) -> GridCell:
@@ -119,13 +111,10 @@ class Grid:
 
     name: str
     title: str
-    common: Sections
-    """Settings shared by all blocks, axes as lists."""
-    blocks: list[Sections]
-    """Settings of each block's own table."""
+    common: Sections  # settings shared by all blocks, axes as lists
+    blocks: list[Sections]  # settings of each block's own table
     wheres: list[Where]
-    last: Sections
-    """Settings with the highest precedence: from [testing] and --change."""
+    last: Sections  # settings with the highest precedence: from [testing] and --change
 
     def cells(self) -> list[GridCell]:
         """All cells without duplicates, ordered by seed: every condition runs its first seed before any second one."""

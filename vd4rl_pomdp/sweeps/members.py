@@ -24,8 +24,7 @@ class GridMembers(Choice):
         """Work out what some cells of the grid `name` compute; UserError if one is invalid, or trains in a maze."""
         self._what = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
-        self._policies: set[tuple[Any, ...]] = set()
-        """Values of LABELS of the policies that the cells train."""
+        self._policies: set[tuple[Any, ...]] = set()  # values of LABELS of the policies that the cells train
         check_cells(cells, name)
         for cell in cells:
             if "navigation_train" in cell.chain:
@@ -51,13 +50,13 @@ class GridMembers(Choice):
 
     @property
     def wanted(self) -> list[Row]:
-        """Labels of the policies that the cells ask for."""
         return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
     def _has(self, run: Result) -> bool:
         """Whether some cell asks for this run. Without collection settings (imported data), task and quality decide."""
         sets = self._sets.get(run.recipe, ())
-        if run.record.get("collection"):
+        collection = run.record.get("collection")
+        if collection and "format" not in collection:
             return run.on_one_set and any(data.alike(run.record) for data in sets)
         labels = {name: run.labels[name] for name in ("task", "quality")}
         return run.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
