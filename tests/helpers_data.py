@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data.folder import shard_paths
 from vd4rl_pomdp.data.format import FRAMES_KEY, read_frames, read_rows, write_shard
 
 
@@ -94,3 +95,16 @@ def read_shard(path: Path) -> dict[str, np.ndarray]:
     """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, S, S) uint8 frames."""
     rows = read_rows(path)
     return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}
+
+
+def rows_of_set(folder: Path) -> dict[str, np.ndarray]:
+    """All rows of a set, as `read_shard`."""
+    shards = [read_shard(shard) for shard in shard_paths(folder)]
+    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+
+
+def assert_equal_rows(left: dict[str, np.ndarray], right: dict[str, np.ndarray], but: Sequence[str] = ()) -> None:
+    """Fail unless all keys but some hold the same."""
+    assert left.keys() - set(but) == right.keys() - set(but)
+    for key in left.keys() - set(but):
+        np.testing.assert_array_equal(left[key], right[key], err_msg=key)

@@ -74,6 +74,7 @@ def lists(folder: Path) -> list[str]:
 
 def test_an_encoder_comes_back_as_it_was_and_what_is_there_is_not_fetched_again(hub, encoder, tmp_path):
     assert "/models/lab/encoder/commit/" in push(encoder, ENCODER)
+    (tmp_path / "new" / "encoder").mkdir(parents=True)
     assert pull(ENCODER, tmp_path / "new" / "encoder")
     assert content(tmp_path / "new" / "encoder") == content(encoder)
     assert load_encoder(tmp_path / "new" / "encoder")[1] == CARD
@@ -225,27 +226,21 @@ def test_a_cut_transfer_is_resumed(hub, encoder, tmp_path, monkeypatch):
     assert content(tmp_path / "new") == content(encoder)
 
 
-@pytest.mark.parametrize("what", ["a file", "a folder", "an encoder", "a link", "an empty folder"])
-def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, what):
+FOREIGN = {
+    "a file": lambda path: path.write_text("mine"),
+    "a link": lambda path: path.symlink_to("nowhere"),
+    "an encoder": lambda path: save_encoder(path, make("gru", True), replace(CARD, seed=7)),
+    "a folder": lambda path: (path.mkdir(), (path / ".env").write_text("mine")),
+}
+
+
+@pytest.mark.parametrize("write", FOREIGN.values(), ids=FOREIGN)
+def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, write):
     push(encoder, ENCODER)
-    target = tmp_path / "there"
-    if what == "a file":
-        target.write_text("mine")
-    elif what == "a link":
-        target.symlink_to(tmp_path / "nowhere")
-    elif what == "an encoder":
-        save_encoder(target, make("gru", True), replace(CARD, seed=7))
-    else:
-        target.mkdir()
-        if what == "a folder":
-            (target / ".env").write_text("mine")
-    if what == "an empty folder":
-        assert pull(ENCODER, target)
-        assert content(target) == content(encoder)
-        return
+    write(tmp_path / "there")
     before = content(tmp_path)
     with pytest.raises(UserError, match="is not empty and holds something other than lab/encoder; choose another"):
-        pull(ENCODER, target)
+        pull(ENCODER, tmp_path / "there")
     assert content(tmp_path) == before
     assert lists(tmp_path) == ["run", "there"]
 

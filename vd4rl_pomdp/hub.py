@@ -42,7 +42,6 @@ from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 
 LISTING = "vd4rl_pomdp.json"
-"""File name of the listing."""
 ENCODER, AGENT, SET = "an encoder", "an agent", "a data set"
 """Kinds of repository, named as by `runs.outputs.kept_in`."""
 _FORMAT = 1
@@ -55,15 +54,9 @@ _PATTERNS = {ENCODER: _MODEL, AGENT: _MODEL, SET: ["*.hdf5", "*.HDF5", "*.h5", "
 def push(folder: Path, repository: str, private: bool = False, revision: str = "main", license: str = LICENSE) -> str:
     """Push an encoder, an agent or a data set as one commit; returns the commit's URL.
 
-    Args:
-        folder: the folder of the encoder, agent or data set; its contents are checked first.
-        repository: OWNER/NAME or datasets/OWNER/NAME, created if needed; must not hold files from elsewhere.
-        private: create the repository as private.
-        revision: branch to push to, created if needed.
-        license: Hub identifier of the licence for the card, such as "mit".
-
-    Raises:
-        UserError: the folder holds nothing of that kind or is damaged, or the Hub refuses or cannot be reached.
+    The `repository`, OWNER/NAME or datasets/OWNER/NAME, and the branch `revision` are created if needed. `license` is a
+    Hub identifier such as "mit". UserError if the folder holds nothing of that kind or is damaged, the repository holds
+    files from elsewhere, or the Hub refuses or cannot be reached.
     """
     name, kind = _repository(repository)
     held = kept_in(folder) or (SET if shard_files(folder) else None)  # `_checked` below reports damaged shards
@@ -103,15 +96,9 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
 def pull(repository: str, folder: Path, revision: str = "main") -> bool:
     """Download an encoder, an agent or a data set; returns False if `folder` already holds exactly that.
 
-    An interrupted pull is resumed. `folder` is created only when everything is downloaded and verified.
-
-    Args:
-        repository: a repository written by `push`.
-        folder: folder to create; it may exist if empty.
-        revision: branch, tag or commit.
-
-    Raises:
-        UserError: the folder holds something else, a download is damaged, or the Hub refuses or cannot be reached.
+    An interrupted pull is resumed. `folder` is created only when everything is downloaded and verified. `revision` is a
+    branch, tag or commit. UserError if the folder holds something else, a download is damaged, or the Hub refuses or
+    cannot be reached.
     """
     _, kind = _repository(repository)
     folder = Path(os.path.abspath(folder))
@@ -179,12 +166,10 @@ def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
 def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str], str, str]:
     """Read a listing: (SHA-256 by file name, licence, kind); UserError if it is damaged."""
     listing = read_json(path)
-    files = listing.get("sha256")
-    files = files if isinstance(files, dict) else {}
-    names = set(files)
+    files = found if isinstance(found := listing.get("sha256"), dict) else {}
     kind = AGENT if (kind, listing.get("kind")) == (ENCODER, AGENT) else kind
-    plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in names)
-    fits = names == set(_FILES[kind]) if kind in _FILES else plain and any(map(is_shard_name, names))
+    plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in files)
+    fits = files.keys() == set(_FILES[kind]) if kind in _FILES else plain and any(map(is_shard_name, files))
     if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not fits:
         raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner")
     return files, str(listing.get("license", "")), kind
@@ -211,30 +196,27 @@ def _agent_card(folder: Path, repository: str, license: str) -> str:
     """README.md of an agent: its card and how to load it."""
     card = read_json(folder / agents.CARD)
     names = [str(card.get(name)) for name in ("method", "algorithm", "task")]
-    values = {
-        "license": license,
-        "library_name": "vd4rl-pomdp",
-        "pipeline_tag": TAGS[0],
-        "tags": [*TAGS, *map(one_line, names)],
-    }
-    title = "# {} and {} on {}".format(*map(code, names))
-    what = "Encoder and policy, trained offline by `vd4rl-pomdp`; weights in half precision."
-    get = code_block([f"vd4rl-pomdp hub pull {repository} FOLDER"], "bash")
+    values = {"license": license, "library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0]}
     use = ["from vd4rl_pomdp import load_agent", "", 'agent = load_agent("FOLDER")  # agent.reset(), agent.act(obs)']
-    told = code_block(json.dumps(card, indent=2).splitlines(), "json")
-    return "\n".join(
-        [*front_matter(values), "", title, "", what, "", *get, "", *code_block(use, "python"), "", *told, ""]
+    parts = (
+        front_matter(values | {"tags": [*TAGS, *map(one_line, names)]}),
+        ["# {} and {} on {}".format(*map(code, names))],
+        ["Encoder and policy, trained offline by `vd4rl-pomdp`; weights in half precision."],
+        code_block([f"vd4rl-pomdp hub pull {repository} FOLDER"], "bash"),
+        code_block(use, "python"),
+        code_block(json.dumps(card, indent=2).splitlines(), "json"),
     )
+    return "\n".join(line for part in parts for line in (*part, ""))
 
 
 def _set_card(folder: Path, repository: str, license: str) -> str:
     """README.md of a data set: its data card or, if it has none, a title from its files' attributes."""
-    names = task_and_quality(folder, [read_attributes(shard) for shard in shard_paths(folder)])
-    told = folder / "card.md"
-    title = f"# {', '.join(code(name or 'unknown') for name in names)}\n"
-    body = read_bytes(told).decode(errors="replace") if told.is_file() else title
-    use = code_block([f"vd4rl-pomdp hub pull datasets/{repository} FOLDER"], "bash")
-    tags = [*TAGS[:2], *(one_line(name) for name in names if name)]
-    return "\n".join(
-        [*front_matter({"license": license, "tags": tags}), "", body.rstrip(), "", "## Use it", "", *use, ""]
+    names, card = (
+        task_and_quality(folder, [read_attributes(shard) for shard in shard_paths(folder)]),
+        folder / "card.md",
     )
+    title = f"# {', '.join(code(name or 'unknown') for name in names)}"
+    body = read_bytes(card).decode(errors="replace").rstrip() if card.is_file() else title
+    tags = [*TAGS[:2], *(one_line(name) for name in names if name)]
+    use = code_block([f"vd4rl-pomdp hub pull datasets/{repository} FOLDER"], "bash")
+    return "\n".join([*front_matter({"license": license, "tags": tags}), "", body, "", "## Use it", "", *use, ""])

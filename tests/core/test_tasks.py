@@ -141,24 +141,6 @@ def test_an_unknown_task_of_dm_control_is_one_line():
         layout_of(DMCTask("carpole", "swingup"))
 
 
-def test_what_is_no_task_is_not_registered():
-    with TASKS.isolated():
-        with pytest.raises(
-            UserError, match=r"task 'mine' is a str, not a vd4rl_pomdp\.core\.tasks\.DMCTask or GymnasiumTask"
-        ):
-            TASKS.register("mine", "cartpole")
-        with pytest.raises(UserError, match="a task called 'walker_walk' exists already"):
-            TASKS.register("walker_walk", DMCTask("walker", "walk"))
-    with pytest.raises(UserError, match="unknown task 'mine': choose one of walker_walk, cheetah_run, humanoid_walk"):
-        TASKS.named("mine")
-
-
-@pytest.mark.parametrize("name", ["my/cartpole", "/cartpole", "cartpole/", "", ".", ".."])
-def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
-    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': folders and `--only` contain names"):
-        TASKS.register(name, DMCTask("cartpole", "swingup"))
-
-
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [

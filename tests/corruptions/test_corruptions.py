@@ -7,7 +7,6 @@ import torch
 from tests.helpers_data import fake_rows
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat, settings_of
-from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.corruptions import (
     CORRUPTIONS,
     STAGES,
@@ -16,7 +15,6 @@ from vd4rl_pomdp.corruptions import (
     KeyStream,
     Patch,
     augmentation,
-    derive_keys,
     draw_integers,
     make_corruption,
 )
@@ -113,18 +111,6 @@ def test_zero_frames_blanks_two_of_three_each_equally_often():
     assert ((blank.float().mean(0) - 2 / 3).abs() < 0.03).all()
 
 
-@pytest.mark.parametrize("name", CORRUPTIONS)
-def test_equal_keys_give_equal_masks_whatever_the_batch(name: str):
-    obs, corruption = stacks(8), make_corruption(name)
-    key = torch.arange(100, 108)
-    whole = corruption(obs, key)
-    alone = torch.cat([corruption(obs[i : i + 1], key[i : i + 1]) for i in range(8)])
-    assert torch.equal(whole, alone)
-    windows = corruption(obs.view(2, 4, 9, 84, 84), key.view(2, 4))
-    assert torch.equal(windows.view_as(whole), whole)
-    assert torch.equal(obs, stacks(8)), "the input was changed"
-
-
 def test_resample_draws_anew_and_emission_never_does():
     obs, row_key = stacks(4), torch.arange(4)
     for mode, same in (("resample", False), ("emission", True)):
@@ -132,15 +118,6 @@ def test_resample_draws_anew_and_emission_never_does():
         assert torch.equal(corruption(obs.clone(), row_key), corruption(obs.clone(), row_key)) == same
     a, b = (BatchCorruption(CorruptionConfig.of("patch"), seed=3) for _ in range(2))
     assert torch.equal(a(obs.clone(), row_key), b(obs.clone(), row_key))
-
-
-def test_emission_of_a_batch_equals_the_environments_draw():
-    obs, row_key = stacks(4), torch.tensor([5, 6, 1 << 20, (1 << 20) + 1])
-    batch = BatchCorruption(CorruptionConfig.of("patch+zero_frames", "emission"), seed=7)(obs, row_key)
-    environment = make_corruption("patch+zero_frames")
-    seed = stream_seed(7, "corruption", "emission")
-    single = torch.cat([environment(obs[i : i + 1], derive_keys(seed, row_key[i : i + 1])) for i in range(4)])
-    assert torch.equal(batch, single)
 
 
 def test_a_key_stream_goes_on_from_its_position():
@@ -261,20 +238,6 @@ def test_what_was_recorded_before_frames_could_be_kept_has_the_same_settings():
     old = {"corruption": "zero_frames", "corruption_mode": "resample", "zeroed_frames": 2}
     assert settings_of(flat(CorruptionConfig.of("zero_frames"))) == old
     assert settings_of(flat(CorruptionConfig.of("zero_frames", keep_newest=True))) == old | {"keep_newest": True}
-
-
-@pytest.mark.parametrize("name", CORRUPTIONS)
-@pytest.mark.parametrize("mode", ["resample", "emission"])
-@pytest.mark.parametrize("zeroed", [1, 3])
-def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, name, mode, zeroed):
-    chosen = {"corruption": name, "corruption_mode": mode, "patch_fill": 7, "patch_count": 2, "zeroed_frames": zeroed}
-    config = CorruptionConfig.fill(chosen)
-    rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
-    for pad in (0, 4):
-        apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, pad, 1, "a")
-        for _ in range(2):
-            expected = apart(random_shift(View(dataset).stacks(rows), key, pad).clone(), dataset.keys(rows))
-            assert torch.equal(together.observe(rows, key), expected)
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)

@@ -11,13 +11,12 @@ import pytest
 
 from finetune.train import finetune
 from pretrain.train import pretrain
-from tests.helpers_data import fake_episode, fake_frame, fake_reward, read_shard, write_fake_set
+from tests.helpers_data import assert_equal_rows, fake_episode, fake_frame, fake_reward, rows_of_set, write_fake_set
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.folder import shard_paths
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.transfer import export_set, import_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
@@ -41,17 +40,6 @@ def minari(tmp_path, monkeypatch):
     """The library, whose own folder is the test's."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return pytest.importorskip("minari")
-
-
-def rows_of_set(folder):
-    shards = [read_shard(shard) for shard in shard_paths(folder)]
-    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
-
-
-def assert_equal(left, right, but=()):
-    assert left.keys() - set(but) == right.keys() - set(but)
-    for key in left.keys() - set(but):
-        np.testing.assert_array_equal(left[key], right[key], err_msg=key)
 
 
 class Screen(gymnasium.Env):
@@ -198,7 +186,7 @@ def test_minari_out_and_in_loses_nothing(minari, tmp_path):
     assert episode.truncations[-1]
     assert not episode.terminations.any()
     main(["data", "import", "minari", "walker/mine-v0", str(tmp_path / "back")])
-    assert_equal(rows_of_set(folder), rows_of_set(tmp_path / "back"))
+    assert_equal_rows(rows_of_set(folder), rows_of_set(tmp_path / "back"))
     dataset = open_dataset(tmp_path / "back", tmp_path / "cache")
     assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
 
@@ -343,7 +331,7 @@ def test_npz_episodes_out_and_in_lose_nothing_but_states(tmp_path, capsys):
         assert first["image"].shape == (20, 84, 84, 3)
         assert [first[key].nonzero()[0].tolist() for key in ("is_first", "is_last", "is_terminal")] == [[0], [19], []]
     main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "cheetah_run")])
-    assert_equal(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
+    assert_equal_rows(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
 
 
 def test_published_64_pixel_sets_are_told_to_be_cut_short(tmp_path, capsys):
@@ -369,7 +357,7 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     np.testing.assert_array_equal(
         frames, [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]
     )
-    assert_equal(rows_of_set(tmp_path / "own"), rows_of_set(tmp_path / "small"), but=["observation"])
+    assert_equal_rows(rows_of_set(tmp_path / "own"), rows_of_set(tmp_path / "small"), but=["observation"])
 
 
 def test_a_cut_import_goes_on_and_ends_in_the_same_files(tmp_path, monkeypatch):

@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from tests.helpers_data import fake_episode, fake_reward, read_shard, write_fake_set
+from tests.helpers_data import assert_equal_rows, fake_episode, fake_reward, rows_of_set, write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.folder import shard_paths
 from vd4rl_pomdp.data.format import FRAMES_KEY, write_shard
 from vd4rl_pomdp.data.formats.lerobot import LEROBOT, _encode
 from vd4rl_pomdp.data.transfer import export_set, import_set
@@ -21,17 +20,6 @@ pq = pytest.importorskip("pyarrow.parquet")
 LENGTHS = [20, 25, 9]
 PICTURE = "observation.image"
 DATA, INDEX = (f"{part}/chunk-000/file-000.parquet" for part in ("data", "meta/episodes"))
-
-
-def rows_of_set(folder):
-    shards = [read_shard(shard) for shard in shard_paths(folder)]
-    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
-
-
-def assert_equal(left, right, but=()):
-    assert left.keys() == right.keys()
-    for key in left.keys() - set(but):
-        np.testing.assert_array_equal(left[key], right[key], err_msg=key)
 
 
 @pytest.fixture
@@ -83,7 +71,7 @@ def test_pictures_in_the_rows_lose_nothing(tmp_path, capsys):
     assert "20 a second" in capsys.readouterr().err
     main(["data", "import", "lerobot", str(tmp_path / "out"), str(tmp_path / "back")])
     assert capsys.readouterr().err.count("note:") == 0
-    assert_equal(rows_of_set(own), rows_of_set(tmp_path / "back"))
+    assert_equal_rows(rows_of_set(own), rows_of_set(tmp_path / "back"))
     dataset = open_dataset(tmp_path / "back", tmp_path / "cache")
     assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
 
@@ -115,7 +103,7 @@ def test_video_changes_pictures_alone_and_says_by_how_much(tmp_path, capsys):
     assert "values are off by" in capsys.readouterr().err
     import_set("lerobot", str(tmp_path / "out"), tmp_path / "back")
     back = rows_of_set(tmp_path / "back")
-    assert_equal(rows_of_set(own), back, but=[FRAMES_KEY])
+    assert_equal_rows(rows_of_set(own), back, but=[FRAMES_KEY])
     assert np.abs(back[FRAMES_KEY].astype(int) - rows[FRAMES_KEY]).max() <= 2
     # LeRobot puts many episodes into one video: here the same one begins at 0.4 seconds
     film = tmp_path / "out" / "videos" / "observation.image" / "chunk-000" / "file-000.mp4"
@@ -152,7 +140,7 @@ def test_reading_from_an_episode_on_gives_the_same_rows(exported):
     opened = LEROBOT.read(str(exported[0]), None)
     for first in range(3):
         for late, whole in zip(opened.read(first), list(opened.read(0))[first:], strict=True):
-            assert_equal(late, whole)
+            assert_equal_rows(late, whole)
 
 
 def test_one_of_several_cameras(exported, tmp_path):

@@ -137,7 +137,7 @@ def test_a_killed_decode_leaves_nothing_that_counts(tmp_path, cache, monkeypatch
     assert visible(cache) == [store.folder.name]
 
 
-@pytest.mark.parametrize("stage", ["_write_frames", "_describe"])
+@pytest.mark.parametrize("stage", ["_write_frames", "_checksum"])
 def test_a_full_disk_removes_what_was_written(tmp_path, cache, monkeypatch, stage):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.helpers_data import fake_action, write_fake_set
+from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import row_key, unpack_row_key
@@ -83,19 +83,6 @@ def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeyp
         same = [torch.equal(seen[0, 0], other) for other in (seen[0, 1], seen[0, 2], seen[1, 0], seen[1, 2])]
         assert same.count(True) <= 1
     assert not torch.equal(view.observe(rows), seen), "the next ones are others"
-
-
-def test_actions_before_and_after_a_row(dataset):
-    rows = dataset.transition_rows
-    assert rows.tolist() == [*range(8), *range(9, 13)]
-    for row, action in zip(rows.tolist(), dataset.action_after(rows), strict=True):
-        episode, t = int(dataset.episode[row]), int(dataset.t[row])
-        torch.testing.assert_close(action, torch.from_numpy(fake_action(episode, t)))
-    history = torch.tensor([[2, 3, 4], [9, 10, 11]])
-    before = dataset.actions_before(history)
-    assert not before[:, 0].any()
-    assert torch.equal(before[:, 1:], dataset.action_after(history[:, :-1]))
-    assert dataset.action[3].any(), "the set itself must keep its actions"
 
 
 def test_row_keys_unpack_and_padding_is_not_real(dataset):

@@ -40,21 +40,6 @@ def test_what_an_actor_reads_is_found_in_stored_states(blind):
     np.testing.assert_allclose(found, np.stack([row.state for row in rows]), atol=1e-5)
 
 
-def test_replaying_shifted_actions_does_not_give_the_rewards(blind):
-    rows, actions = roll(blind, 3, 100)
-    replayed = replay_rewards(name_of(blind), rows[0].physics, np.roll(actions, 1, axis=0))
-    assert np.abs(replayed - [row.reward for row in rows[1:]]).max() > 1e-4
-
-
-def test_the_first_state_depends_on_the_seed_alone(blind):
-    first = blind.reset(5)
-    roll(blind, 6, 10)
-    again, other = blind.reset(5), blind.reset(6)
-    np.testing.assert_array_equal(first.physics, again.physics)
-    np.testing.assert_array_equal(first.state, again.state)
-    assert not np.array_equal(first.physics, other.physics)
-
-
 def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
     start = blind.reset(0).physics
     action = np.full(blind.action_dim, 0.5, np.float32)

@@ -130,13 +130,6 @@ def test_an_end_within_the_repeat_ends_the_episode(truncates, discount):
     assert rows[2].reward == 4 + 5
 
 
-def test_the_limit_of_decisions_ends_an_episode_with_discount_1():
-    _, rows = play(GymnasiumTask(Counter, decisions=2), 2)
-    assert (rows[2].last, rows[2].discount, rows[2].terminated) == (True, 1.0, False)
-    _, rows = play(GymnasiumTask(Counter), 1, length=1)
-    assert rows[1].last
-
-
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-3.0, 5.0), (0.0, 0.5)])
 def test_actions_reach_the_environments_bounds_in_its_shape(low, high):
     env = make_env(GymnasiumTask(Counter, {"low": low, "high": high}))

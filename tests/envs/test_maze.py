@@ -134,27 +134,20 @@ def states_of_grid() -> list[np.ndarray]:
     return [place for place in places if env.is_free(place)]
 
 
-@pytest.mark.parametrize("maze", ["no_curtain", "three_curtains", "hard_no_curtain", "hard_three_curtains"])
-def test_the_fast_picture_is_mujocos(maze):
+TOP = ["no_curtain", "three_curtains", "hard_no_curtain", "hard_three_curtains"]
+
+
+@pytest.mark.parametrize("maze", [*TOP, *FIRST_PERSON])
+def test_the_fast_picture_is_mujocos_but_for_highlights_in_first_person(maze):
     rng = np.random.default_rng(1)
     fast, exact = MazeEnv(maze), MazeEnv(maze, render="exact")
     fast.reset(seed=0), exact.reset(seed=0)
-    for state in states_of(maze, 20, False, fast, rng):
+    turned = [np.array([*fast._free_place(), rng.uniform(-np.pi, np.pi), 0, 0, 0]) for _ in range(20)]
+    for state in states_of(maze, 20, False, fast, rng) if maze in TOP else turned:
         ours, theirs = (env.reset(options={"state": state})[0].astype(int) for env in (fast, exact))
-        assert np.abs(ours - theirs).mean() < 0.1
-        assert np.abs(ours - theirs).max() <= 32
-
-
-@pytest.mark.parametrize("maze", FIRST_PERSON)
-def test_the_fast_first_person_picture_is_mujocos_but_for_its_highlights(maze):
-    rng = np.random.default_rng(1)
-    fast, exact = MazeEnv(maze), MazeEnv(maze, render="exact")
-    fast.reset(seed=0), exact.reset(seed=0)
-    for _ in range(20):
-        state = np.array([*fast._free_place(), rng.uniform(-np.pi, np.pi), 0, 0, 0])
-        ours, theirs = (env.reset(options={"state": state})[0].astype(int) for env in (fast, exact))
-        assert np.abs(ours - theirs).mean() < 6
-        assert (np.abs(ours - theirs) > 20).mean() < 0.02
+        difference = np.abs(ours - theirs)
+        assert difference.mean() < (0.1 if maze in TOP else 6)
+        assert difference.max() <= 32 if maze in TOP else (difference > 20).mean() < 0.02
 
 
 @pytest.mark.parametrize("maze", ["three_curtains", "first_person"])
@@ -221,20 +214,6 @@ def test_the_sky_tells_headings_apart_where_it_is_a_compass():
         assert np.abs(tops[0] - tops[1]).max() >= least, maze
 
 
-def test_stars_stand_still_over_the_maze():
-    """Turning moves the sky; walking leaves it. The floor and the walls are left out of it."""
-    env = MazeEnv("first_person")
-    env.reset(seed=0)
-
-    def sky(*state: float) -> np.ndarray:
-        return env.reset(options={"state": np.array([*state, 0, 0, 0])})[0][2, 0, 30:70].astype(int)
-
-    here, there, turned = sky(-1.0, 1.0, 0.0), sky(-0.9, 1.0, 0.0), sky(-1.0, 1.0, 0.4)
-    assert np.ptp(here) > 10, "stars"
-    np.testing.assert_array_equal(here, there)
-    assert (here != turned).mean() > 0.5
-
-
 def test_hard_first_person_velocities_follow_the_papers_text():
     env = MazeEnv("hard_first_person", pixels=False, action_repeat=1)
     env.reset(seed=0)
@@ -248,33 +227,18 @@ def test_hard_first_person_velocities_follow_the_papers_text():
     assert turned - heading == pytest.approx(0.5 * 4.0 * 0.01, rel=1e-6)
 
 
-@pytest.mark.parametrize("maze", FIRST_PERSON)
-def test_first_person_sees_where_it_looks(maze):
-    env = MazeEnv(maze)
-    env.reset(seed=0)
-    place = [1.0, 1.0]
-    near, far = (env.reset(options={"state": np.array([*place, a, 0, 0, 0])})[0] for a in (0.0, np.pi))
-    share = [((obs[0] > obs[1] + 20) & (obs[1] > obs[2] + 20)).mean() for obs in (near[:, 50:], far[:, 50:])]
-    assert share[0] > share[1] + 0.1, "the near wall fills more of the picture than the corridor"
-
-
-def test_goals_move_when_they_are_reached():
-    env = MazeEnv("no_curtain", pixels=False)
-    env.reset(seed=0)
-    env.set_state(np.array([*env.goal, 0.0, 0.0]))
-    goal = env.goal
-    _, reward, terminated, truncated, info = env.step(np.zeros(2))
-    assert (reward, terminated, truncated) == (1.0, False, False)
-    assert not np.allclose(goal, info["goal"])
-
-
-def test_goals_are_the_points_that_stand_for_cells_where_the_papers_planner_drives():
+def test_goals_move_when_they_are_reached_and_are_the_points_that_stand_for_cells():
     env = MazeEnv("no_curtain", pixels=False)
     goals = set()
     for seed in range(60):
         env.reset(seed=seed)
-        assert env.is_free(env.goal)
-        goals.add(tuple(np.round(env.goal, 6)))
+        goal = env.goal
+        assert env.is_free(goal)
+        goals.add(tuple(np.round(goal, 6)))
+    env.set_state(np.array([*goal, 0.0, 0.0]))
+    _, reward, terminated, truncated, info = env.step(np.zeros(2))
+    assert (reward, terminated, truncated) == (1.0, False, False)
+    assert not np.allclose(goal, info["goal"])
     assert goals == {(x + 0.2, y - 0.2) for x, y in [(-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1)]}
 
 

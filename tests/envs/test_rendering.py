@@ -117,16 +117,6 @@ def test_pictures_do_not_depend_on_the_size_of_the_buffer_they_are_drawn_in(task
     np.testing.assert_array_equal(rendering.FrameCamera(other).frame(), frame)
 
 
-def test_a_picture_stays_what_it_was_when_the_next_one_is_drawn():
-    env = make_env(TASKS["walker_walk"])
-    first = env.reset(1).frame
-    kept = first.copy()
-    later = [env.step(np.ones(env.action_dim, np.float32)).frame for _ in range(5)]
-    np.testing.assert_array_equal(first, kept)
-    assert (later[-1] != first).any()
-    assert first.flags.c_contiguous
-
-
 def three_frames(env, between=lambda: None):
     env.reset(1)
     frames = []

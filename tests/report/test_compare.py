@@ -96,7 +96,6 @@ def test_the_command_prints_and_writes_a_page(tmp_path, capsys):
         (["a", "nowhere"], "nowhere: no such folder"),
         (["a", "b/late"], "late: holds no finished and evaluated run to compare"),
         (["a", "b", "--out", "a"], "choose another --out"),
-        (["a", "b", "--out", "a/acro0"], "choose another --out"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, capsys, monkeypatch, words, message):

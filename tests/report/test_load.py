@@ -6,7 +6,7 @@ import pytest
 from tests.helpers_report import describe, pooled, write_run
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report import write_report
-from vd4rl_pomdp.report.load import Choice, episodes_frame, find_gaps, load_runs, runs_frame
+from vd4rl_pomdp.report.load import find_gaps, load_runs
 from vd4rl_pomdp.report.page import unlike
 from vd4rl_pomdp.runs.files import read_json, write_json
 
@@ -50,20 +50,6 @@ def test_labels_and_cards_that_are_not_whole_are_named(tmp_path):
         (run / "encoder" / "config.json").write_text(card)
         with pytest.raises(UserError, match=words):
             write_report([run], tmp_path / "out")
-
-
-def test_the_frames_hold_every_run_and_every_episode(tmp_path):
-    write_run(tmp_path / "a", "acro", 0, {5: [1.0, 2.0], 10: [3.0, 5.0]})
-    (write_run(tmp_path / "b", "mik", 1, {5: [7.0]}) / "timing.json").unlink()
-    runs = load_runs([tmp_path])
-    episodes = episodes_frame(runs)
-    assert episodes.groupby(["method", "step"])["score"].mean().to_dict() == {
-        ("acro", 5): 1.5, ("acro", 10): 4.0, ("mik", 5): 7.0,
-    }  # fmt: skip
-    (row,) = runs_frame(runs).to_dict("records")
-    assert (row["method"], row["score"], row["return"], row["best_step"], row["finetune_seconds"]) == (
-        "acro", 4.0, 40.0, 10, 3.0,
-    )  # fmt: skip
 
 
 def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
@@ -286,17 +272,3 @@ def test_the_state_is_not_missing_where_other_pixels_of_the_same_set_are_hidden(
         ("medium", "none", "state"),
         ("medium", "patch", "state"),
     }
-
-
-def test_policies_that_are_wanted_are_missed_where_anything_of_their_setting_is_there(tmp_path):
-    labels = {"task": "walker_walk", "quality": "expert", "corruption": "patch", "algorithm": "td3_bc"}
-    describe(write_run(tmp_path / "a", "acro", 0, {10: [1.0]}), {"patch_size": 16})
-
-    class Wanted(Choice):
-        wanted = tuple(
-            labels | {"method": method, "quality": quality, "seed": seed}
-            for method, quality, seed in (("acro", "expert", 0), ("acro", "expert", 1), ("mik", "medium", 4))
-        )
-
-    found = find_gaps(load_runs([tmp_path]), Wanted())
-    assert [(row["method"], row["seed"], row["state"]) for row in found] == [("acro", 1, "missing")]

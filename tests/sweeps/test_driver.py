@@ -18,8 +18,7 @@ from vd4rl_pomdp.core.errors import TEMPORARY, DiskFullError, UserError
 from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished
-from vd4rl_pomdp.sweeps.options import LocalOptions
-from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
+from vd4rl_pomdp.sweeps.options import JOB_VARIABLE, LocalOptions
 
 
 @pytest.fixture(autouse=True)

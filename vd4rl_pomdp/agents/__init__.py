@@ -72,11 +72,7 @@ class Agent:
 
 
 def load_agent(name: Path | str) -> Agent:
-    """Load a shipped agent by name, or any agent by folder; it is ready for a new episode.
-
-    Raises:
-        UserError: there is no such agent, or its files are damaged.
-    """
+    """Load a shipped agent by name, or any agent by folder; UserError if there is none or its files are damaged."""
     folder, card = find_agent(name)
     return Agent(load_encoder(folder / "encoder", card["task"])[0], load_policy(folder / "policy"), card)
 
@@ -110,8 +106,7 @@ def checksums(folder: Path) -> dict[str, str]:
 def write_rounded(run: Path, folder: Path) -> None:
     """Write a run's encoder and policy with weights rounded to float16; they are loaded and computed as float32.
 
-    Raises:
-        UserError: a file is missing or damaged, a weight overflows float16, or the folder cannot be written.
+    UserError for a missing or damaged file, or a weight that overflows float16.
     """
     for name in FILES:
         with disk_errors(folder):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, disk_error, in_one_line
 from vd4rl_pomdp.runs import interrupt
-from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
+from vd4rl_pomdp.sweeps.options import JOB_VARIABLE
 
 PROGRAM = "vd4rl-pomdp"
 COMMANDS = {

@@ -11,7 +11,7 @@ import tyro
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.parsing import parse, parse_stage
-from vd4rl_pomdp.sweeps.own_file import program_here
+from vd4rl_pomdp.sweeps.options import program_name
 
 REPLAY_TOLERANCE = 1e-6
 """Largest accepted difference between stored and replayed rewards; 0 on the machine that collected them."""
@@ -24,7 +24,7 @@ def collect(words: list[str], program: str) -> None:
     config = parse(CollectConfig, words, program)
     shards = collect(config)
     print(f"{len(shards)} shards in {config.out}, described in {config.out / 'card.md'}")
-    print(f"check them with `{program_here()} data check {shlex.quote(str(config.out))}`")
+    print(f"check them with `{program_name()} data check {shlex.quote(str(config.out))}`")
 
 
 @command
@@ -51,7 +51,7 @@ def download(
     for one, level in itertools.product(task, quality):
         shards = download(one, level, out, endpoint, verify)
         folder = shards[0].parent
-        check = f"{program_here()} data check {shlex.quote(str(folder))}"
+        check = f"{program_name()} data check {shlex.quote(str(folder))}"
         print(f"{len(shards)} shards in {folder}; check them with `{check}`")
 
 

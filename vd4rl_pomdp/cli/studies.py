@@ -192,8 +192,7 @@ def certify(
     from vd4rl_pomdp.runs.results import CERTIFICATES, certificate_in_words
     from vd4rl_pomdp.studies.certify import GRID, certify, planned
     from vd4rl_pomdp.sweeps.folder import SweepFolder
-    from vd4rl_pomdp.sweeps.options import LocalOptions
-    from vd4rl_pomdp.sweeps.own_file import own_program, refuse_unknown_to_jobs
+    from vd4rl_pomdp.sweeps.options import LocalOptions, own_program, refuse_unknown_to_jobs
 
     refuse_no_folder(out)
     refuse_kept(out)

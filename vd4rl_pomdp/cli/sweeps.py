@@ -17,8 +17,14 @@ from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.core.parsing import parse_stage
-from vd4rl_pomdp.sweeps.options import EXECUTORS, LocalOptions
-from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE, in_words, own_program, program_here, refuse_unknown_to_jobs
+from vd4rl_pomdp.sweeps.options import (
+    EXECUTORS,
+    JOB_VARIABLE,
+    LocalOptions,
+    own_program,
+    program_name,
+    refuse_unknown_to_jobs,
+)
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
@@ -116,7 +122,7 @@ def _print_plan(jobs: list[Job], stack: int) -> None:
         shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
         print(f"# {job.name}: {'done' if done else 'resumes' if job.begun else 'new'}{shared}")
         if not done:
-            print(f"{program_here()} {shlex.join(job.words)}")
+            print(f"{program_name()} {shlex.join(job.words)}")
             left.append(job)
     processes = len(in_stacks(left, stack, {}))
     packed = f" in at least {processes} processes" if processes < len(left) else ""
@@ -152,7 +158,7 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
         left = f"{len(jobs) - found['counts'].get('done', 0)} of {len(jobs)} jobs are not finished"
         retry = f"sweep retry {shlex.quote(str(folder.out))}" + (f" --executor {kind}" if kind != "local" else "")
         same = "" if kind == "local" else ", given this command's flags,"
-        failures = f"{len(found['failures'])} failed; `{in_words(plans[0].program)} {retry}`"
+        failures = f"{len(found['failures'])} failed; `{program_name(plans[0].program)} {retry}`"
         print(f"{left}, {failures}{same} takes those up again")
         sys.exit(1)
     print(f"all {len(jobs)} jobs are finished")

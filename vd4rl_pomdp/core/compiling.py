@@ -17,10 +17,8 @@ def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], An
     """Decorator that compiles a function when one of its arguments is a CUDA tensor.
 
     If compilation fails, e.g. without a C compiler, it warns once and runs the original function, available as
-    `__wrapped__`. `TORCH_COMPILE_DISABLE=1` in the environment turns compilation off.
-
-    Args:
-        training: compile only when gradients are enabled. Elsewhere shapes vary, so compilation does not pay off.
+    `__wrapped__`. `TORCH_COMPILE_DISABLE=1` in the environment turns compilation off. With `training` it compiles only
+    when gradients are enabled: elsewhere shapes vary, so compilation does not pay off.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -81,13 +81,8 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
 
 def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
     """Format two numbers for a message with just enough decimals, at least `decimals`, to show which is larger."""
-
-    def shown(number: float) -> str:
-        return f"{number:,.{decimals}f}"
-
-    while value != limit and shown(value) == shown(limit):
-        decimals += 1
-    return shown(value), shown(limit)
+    texts = f"{value:,.{decimals}f}", f"{limit:,.{decimals}f}"
+    return told_apart(value, limit, decimals + 1) if value != limit and texts[0] == texts[1] else texts
 
 
 OR_ONES_OWN = ", or run or import the file that registers it"
@@ -95,14 +90,7 @@ OR_ONES_OWN = ", or run or import the file that registers it"
 
 
 def refuse_unknown(kind: str, name: object, choices: Iterable[object], remedy: str = "") -> None:
-    """Raise UserError for a name that is not among the choices.
-
-    Args:
-        kind: what is named, e.g. "method".
-        name: the name.
-        choices: valid names.
-        remedy: further advice, appended to the message.
-    """
+    """Raise UserError for the name of a `kind`, e.g. "method", that is not among the choices."""
     if name not in (known := list(choices)):
         raise UserError(f"unknown {kind} {name!r}: choose one of {', '.join(map(str, known))}{remedy}")
 
@@ -158,8 +146,8 @@ def system_error(path: Path, error: Exception) -> UserError | None:
 
     HDF5 puts the errno into its message text, and h5py may even turn it into a KeyError.
     """
-    told = re.search(r"\berrno = (\d+)", str(error))
-    number = int(told[1]) if told else getattr(error, "errno", None)
+    found = re.search(r"\berrno = (\d+)", str(error))
+    number = int(found[1]) if found else getattr(error, "errno", None)
     return None if number in _OF_CONTENT else disk_error(path, OSError(number, os.strerror(number)))
 
 

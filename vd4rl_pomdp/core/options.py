@@ -6,7 +6,7 @@ stage's config; on the command line and in records all settings form one flat li
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
@@ -83,14 +83,9 @@ class StageConfig:
 
     @classmethod
     def of(cls, preset: str = "paper", **settings: Any) -> Self:
-        """Build a stage's settings from names and values.
+        """Build the config from values by name, of the stage's own settings and of the chosen plug-ins' options.
 
-        Args:
-            preset: sets the defaults.
-            settings: values by name, for the stage's own settings and for the chosen plug-ins' options.
-
-        Raises:
-            UserError: an unknown preset or plug-in, a setting that nothing reads, or one defined twice.
+        UserError for an unknown preset or plug-in, or a setting that nothing reads.
         """
         values = cls.defaults(preset) | settings
         parts = cls.parts(values)
@@ -115,12 +110,11 @@ class StageConfig:
     def altered(self, **changes: Any) -> Self:
         """A copy with other settings or plug-ins. Settings that differ from the preset's defaults are kept.
 
-        Raises:
-            UserError: a non-default setting is not read by the newly chosen plug-ins.
+        UserError if one of these is not read by the newly chosen plug-ins.
         """
         usual = self.usual()
-        told = {name: value for name, value in flat(self).items() if value != usual.get(name)}
-        return type(self).of(**({"preset": self.preset} | self._chosen() | told | changes))
+        changed = {name: value for name, value in flat(self).items() if value != usual.get(name)}
+        return type(self).of(**({"preset": self.preset} | self._chosen() | changed | changes))
 
     def with_known(self, **settings: Any) -> Self:
         """A copy with those of the given settings that exist here, e.g. sizes, whatever plug-ins are chosen."""
@@ -151,30 +145,27 @@ def _check_options(config: Any) -> None:
 
 
 def flat(config: Any) -> dict[str, Any]:
-    """All settings of a config by name, including nested options.
-
-    Raises:
-        UserError: two settings share a name, so one flag would set both and a record could hold only one.
-    """
+    """All settings of a config by name, with nested options; UserError if two share a name and thus a flag."""
     found: dict[str, Any] = {}
     owners: dict[str, str] = {}
 
-    def settings(config: Any) -> Iterator[tuple[str, str, Any]]:
+    def add(config: Any) -> None:
+        owner = type(config).__name__
         for field in fields(config):
-            value = getattr(config, field.name)
+            name, value = field.name, getattr(config, field.name)
             nested = options_in(value)
-            if nested is None:
-                yield type(config).__name__, field.name, value
             for options in nested or ():
-                yield from settings(options)
+                add(options)
+            if nested is not None:
+                continue
+            if name in found:
+                raise UserError(
+                    f"{owners[name]} and {owner} both have the setting {name!r}, so {flag_of(name)} would be "
+                    "ambiguous: rename it in your own part"
+                )
+            found[name], owners[name] = value, owner
 
-    for owner, name, value in settings(config):
-        if name in found:
-            raise UserError(
-                f"{owners[name]} and {owner} both have the setting {name!r}, so {flag_of(name)} would be ambiguous: "
-                "rename it in your own part"
-            )
-        found[name], owners[name] = value, owner
+    add(config)
     return found
 
 
@@ -183,8 +174,11 @@ def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
 
     Runs with different settings are never treated as seeds of one experiment.
     """
-    told = {name: value for name, value in config.items() if name not in NO_SETTINGS}
-    return {name: value for name, value in told.items() if name not in LATER or value != LATER[name]}
+    return {
+        name: value
+        for name, value in config.items()
+        if name not in NO_SETTINGS and (name not in LATER or value != LATER[name])
+    }
 
 
 def words_of(settings: Mapping[str, Any]) -> list[str]:
@@ -200,12 +194,7 @@ def words_of(settings: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_options(kind: Any, base: type[Options] = Options) -> None:
-    """Raise UserError for an invalid options class.
-
-    Args:
-        kind: what a plug-in gives as its options class.
-        base: required base class.
-    """
+    """Raise UserError unless `kind`, what a plug-in gives as its options class, is a valid subclass of `base`."""
     if not (isinstance(kind, type) and issubclass(kind, base)):
         raise UserError(
             f"its options are {kind!r}: name a dataclass that is derived from {base.__module__}.{base.__name__}"

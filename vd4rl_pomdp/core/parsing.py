@@ -24,13 +24,9 @@ _TYRO = tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName
 
 
 def parse(config: Any, words: list[str], program: str, default: Any = None) -> Any:
-    """Parse words into an instance of a config class, or call a function with them.
+    """Parse the words after the command `program` into a config class, or call a function with them.
 
-    Args:
-        config: the class or function.
-        words: command-line words after the command.
-        program: the words before them.
-        default: an instance that holds the defaults.
+    `default` is an instance that holds the defaults.
     """
     for before, word in zip(["", *words], words, strict=False):
         # An empty word would parse as Path("."): `--out "$UNSET"` would write to the working directory.
@@ -39,20 +35,20 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
             raise UserError(f"{name} is empty: is a shell variable unset? (see `{program} --help`)")
     words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
     options = {} if default is None else {"default": default}
-    shown = io.StringIO()
+    stderr = io.StringIO()
     try:
-        with contextlib.redirect_stderr(shown):
+        with contextlib.redirect_stderr(stderr):
             parsed = tyro.cli(config, args=words, prog=program, config=_TYRO, **options)
     except SystemExit as end:
         if end.code != 2:
             raise
-        lines = (line for line in shown.getvalue().splitlines() if not line.startswith(("╭", "╰")))
+        lines = (line for line in stderr.getvalue().splitlines() if not line.startswith(("╭", "╰")))
         text = re.sub(r"[\u2500-\u257f]+|-{5,}", " ", " ".join(lines).partition("For full helptext")[0])
         raise UserError(f"{' '.join(text.split())} (see `{program} --help`)") from None
-    told = parsed.keywords if isinstance(parsed, partial) else vars(parsed)
+    parsed_values = parsed.keywords if isinstance(parsed, partial) else vars(parsed)
     for word, after in pairwise([*words, "--"]):
         # tyro accepts an empty list, and `sweep run GRID --only $UNSET` would run everything
-        if after.startswith("--") and told.get(word.removeprefix("--").replace("-", "_")) in ([], ()):
+        if after.startswith("--") and parsed_values.get(word.removeprefix("--").replace("-", "_")) in ([], ()):
             raise UserError(f"{word} has no value: is a shell variable unset? (see `{program} --help`)")
     return parsed
 

@@ -20,7 +20,18 @@ REGISTRIES: dict[str, Registry[Any]] = {}
 
 
 class Registry(Mapping[str, Part], Generic[Part]):
-    """All plug-ins of one kind. The first access loads those of installed packages."""
+    """All plug-ins of one kind. The first access loads those of installed packages.
+
+    Args:
+        kind: name of the kind in messages, e.g. `frame encoder`. It also gives the setting that names a plug-in,
+            `frame_encoder`, and the entry-point group, `vd4rl_pomdp.frame_encoders`.
+        own: the package's plug-ins by name.
+        fits: whether an object is a plug-in of this kind.
+        expected: description of such an object, for messages.
+        refuse: raises UserError for a name or object of this kind that cannot work; it need not name the plug-in.
+        setting: the setting that names a plug-in, if not derived from `kind`.
+        group: the entry-point group, if not derived from the setting.
+    """
 
     def __init__(
         self,
@@ -32,18 +43,6 @@ class Registry(Mapping[str, Part], Generic[Part]):
         setting: str = "",
         group: str = "",
     ) -> None:
-        """See the class.
-
-        Args:
-            kind: name of the kind in messages, e.g. `frame encoder`. It also gives the setting that names a plug-in,
-                `frame_encoder`, and the entry-point group, `vd4rl_pomdp.frame_encoders`.
-            own: the package's plug-ins by name.
-            fits: whether an object is a plug-in of this kind.
-            expected: description of such an object, for messages.
-            refuse: raises UserError for a name or object of this kind that cannot work; it need not name the plug-in.
-            setting: the setting that names a plug-in, if not derived from `kind`.
-            group: the entry-point group, if not derived from the setting.
-        """
         self.kind, self.setting = kind, setting or kind.replace(" ", "_")
         self.group = group or f"vd4rl_pomdp.{self.setting}s"
         self.broken: dict[str, str] = {}
@@ -60,10 +59,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
     def register(self, name: str, part: Part, replace: bool = False) -> None:
         """Add your own plug-in; UserError if the name is taken or the plug-in cannot work.
 
-        Args:
-            name: its name.
-            part: the plug-in.
-            replace: whether it may replace one added by such a call, e.g. when a notebook cell is run again.
+        `replace`: it may replace one added by such a call, e.g. when a notebook cell is run again.
         """
         self._add(name, part, BY_CALL, sys._getframe(1).f_code.co_filename, replace)
 
@@ -150,10 +146,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
 
 
 def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """Origin and source hashes of the third-party plug-ins that settings name, for a run's record.
-
-    Args:
-        settings: a stage's settings by name; registries are found by their `setting`.
+    """Origin and source hashes of the third-party plug-ins that a stage's settings name, for a run's record.
 
     Returns:
         `plugins`: where they come from, {"method mine": "its 1.2"}.
@@ -177,13 +170,9 @@ def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> lis
 
 
 def warn_of_other_code(place: object, record: Mapping[str, Any], settings: Mapping[str, Any], what: str) -> None:
-    """Warn about each plug-in whose code has changed.
+    """Warn about each plug-in named in settings whose code has changed since `record`, from `code_of`.
 
-    Args:
-        place: what was made with the earlier code.
-        record: record of that code, as from `code_of`.
-        settings: settings that name the plug-ins.
-        what: end of the sentence: since when, and what it means.
+    `place` is what was made with the earlier code; `what` ends the sentence: since when, and what it means.
     """
     for part in of_other_code(record, settings):
         print(f"warning: {place}: the code of {part} has changed since {what}", file=sys.stderr)

@@ -14,15 +14,7 @@ import torch
 
 
 def stream_seed(seed: int, *name: str | int) -> int:
-    """Seed of one stream.
-
-    Args:
-        seed: the run's seed.
-        name: path of the stream, from general to specific: ("finetune", "corruption", view).
-
-    Returns:
-        An integer in 0..2^63-1, the same on every machine.
-    """
+    """Seed in 0..2^63-1 of the stream of a run's `seed` and a path, such as ("finetune", "corruption", view)."""
     key = [int.from_bytes(hashlib.blake2b(repr(part).encode(), digest_size=8).digest()) for part in name]
     # Halved because torch seeds must be below 2^63.
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0]) >> 1

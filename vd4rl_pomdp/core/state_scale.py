@@ -32,12 +32,7 @@ class StateScale:
         return cls(values.mean(0), torch.where(variance > LEAST_VARIANCE, variance, 0).sqrt(), pose)
 
     def noise(self, pose: float, velocity: float) -> Tensor:
-        """Std (P,) float64 of Gaussian noise whose mean absolute value is a percentage of each coordinate's std.
-
-        Args:
-            pose: percent, for poses.
-            velocity: percent, for velocities.
-        """
+        """Std (P,) float64 of Gaussian noise with a mean absolute value of `pose` and `velocity` percent of the std."""
         percent = torch.full_like(self.std, velocity)
         percent[: self.pose] = pose
         return percent / 100 * self.std * math.sqrt(math.pi / 2)

@@ -49,25 +49,19 @@ class _Draw:
 
 
 class RandomStream:
-    """Numbers of one stream: the same on every device, and the same one by one as in blocks.
+    """Numbers of one stream on a device: the same on every device, and the same one by one as in blocks.
 
     A stream of several runs trained together (`stacked`) serves each run's own numbers: every shape requested and
-    returned starts with the number of runs.
+    returned starts with the number of runs. `generator` is on the CPU, at the stream's start.
     """
 
     def __init__(self, generator: torch.Generator, device: torch.device | str = "cpu") -> None:
-        """See the class.
-
-        Args:
-            generator: on the CPU, at the stream's start.
-            device: device of the returned tensors.
-        """
         self._generators, self._device = [generator], torch.device(device)
         self._runs: tuple[int, ...] = ()
         """(number of runs,) for a stacked stream, else ()."""
-        self._asked: dict[int, list[_Draw]] = {}
+        self._requests: dict[int, list[_Draw]] = {}
         """By turn: requests of its step when it last ran eagerly."""
-        self._noted: list[_Draw] | None = None
+        self._recorded: list[_Draw] | None = None
         """Requests of the step that is running; None outside steps that may be replayed."""
         self._turn, self._place = 0, 0
         self._block: Tensor | None = None
@@ -106,24 +100,24 @@ class RandomStream:
         """Start a step of `turn`: record its requests or, in blocks, read from its row."""
         self._turn, self._place = turn, 0
         if self._block is None:
-            self._noted = self._asked[turn] = []
+            self._recorded = self._requests[turn] = []
         else:
             self._row = self._block.index_select(0, self._counter)[0]
 
     def end(self) -> None:
         """End a step; in blocks, advance to the next row. Part of what is captured and replayed."""
-        self._noted = None
+        self._recorded = None
         if self._block is not None:
-            if self._place < len(self._asked[self._turn]):
+            if self._place < len(self._requests[self._turn]):
                 raise RuntimeError("a step asked for fewer random numbers than the steps before it")
             self._counter.add_(1)
 
     def in_blocks(self) -> None:
         """Switch to blocks. Every turn must have run once, and turn 0 comes next."""
         self._offsets, width = {}, _ALIGNED
-        for turn, asked in self._asked.items():
+        for turn, requests in self._requests.items():
             ends = [0]
-            for draw in asked:
+            for draw in requests:
                 ends.append(ends[-1] + -(-draw.size // _ALIGNED) * _ALIGNED)
             self._offsets[turn], width = ends[:-1], max(width, ends[-1])
         shape = BLOCK, len(self._generators), width
@@ -133,7 +127,7 @@ class RandomStream:
 
     def one_by_one(self) -> None:
         """Switch back to drawing one by one, continuing after the steps done so far."""
-        self._noted = None
+        self._recorded = None
         if self._block is not None:
             states = [self.get_state(run) for run in range(len(self._generators))]
             for generator, state in zip(self._generators, states, strict=True):
@@ -160,8 +154,8 @@ class RandomStream:
     def _draw_steps(self, generator: torch.Generator, run: int, steps: int, rows: Tensor | None = None) -> None:
         """Draw a run's numbers for `steps` steps from the block's first turn on, into `rows` (steps, bytes) if any."""
         for step in range(steps):
-            turn = (self._first + step) % len(self._asked)
-            for draw, offset in zip(self._asked[turn], self._offsets[turn], strict=True):
+            turn = (self._first + step) % len(self._requests)
+            for draw, offset in zip(self._requests[turn], self._offsets[turn], strict=True):
                 drawn = draw.made(generator, run)
                 if rows is not None:
                     rows[step, offset : offset + draw.size] = drawn.view(-1).view(torch.uint8)
@@ -174,14 +168,14 @@ class RandomStream:
             )
         draw = _Draw(kind, shape[len(self._runs) :], high)
         if self._block is None:
-            if self._noted is not None:
-                self._noted.append(draw)
+            if self._recorded is not None:
+                self._recorded.append(draw)
             made = [draw.made(generator, run) for run, generator in enumerate(self._generators)]
             drawn = torch.stack(made) if self._runs else made[0]
             # asynchronous to a GPU; to the CPU that would allow reads before the copy is done
             return drawn.to(self._device, non_blocking=self._device.type != "cpu")
-        asked, place = self._asked[self._turn], self._place
-        if place >= len(asked) or asked[place] != draw:
+        requests, place = self._requests[self._turn], self._place
+        if place >= len(requests) or requests[place] != draw:
             raise RuntimeError(f"a step asked for {draw}, other random numbers than the steps before it")
         self._place += 1
         offset = self._offsets[self._turn][place]

@@ -71,7 +71,13 @@ class Layout:
         positions, turning = physics[..., : self.positions].copy(), physics[..., list(self.turning)]
         for first in self.beside:
             positions[..., first : first + 2] -= positions[..., list(self.travel)]
-        rotations = [_two_columns(positions[..., first : first + 4]) for first in self.quaternions]
+        rotations = []
+        for first in self.quaternions:  # unit quaternions, real part first
+            w, x, y, z = np.moveaxis(positions[..., first : first + 4], -1, 0)
+            rotations += [
+                np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1),
+                np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1),
+            ]
         replaced = [column for first in self.quaternions for column in range(first, first + 4)]
         plain = np.delete(positions, [*self.travel, *self.turning, *replaced, *self.unseen], axis=-1)
         return np.concatenate([plain, np.sin(turning), np.cos(turning), *rotations], axis=-1)
@@ -83,14 +89,6 @@ class Layout:
     def visible_state(self, physics: np.ndarray) -> np.ndarray:
         """(..., P') float32: pose and velocity."""
         return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
-
-
-def _two_columns(quaternion: np.ndarray) -> np.ndarray:
-    """First two columns (..., 6) of the rotation matrices of (..., 4) unit quaternions, real part first."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
-    second = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
-    return np.stack([*first, *second], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +129,8 @@ class DMCTask(Task):
     def summary(self) -> str:
         """One-line description."""
         own = "." in self.domain
-        shown = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
-        return f"{shown}, camera {self.camera}, {super().summary}"
+        title = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
+        return f"{title}, camera {self.camera}, {super().summary}"
 
 
 @dataclass(frozen=True)

@@ -24,16 +24,16 @@ def markdown(text: str) -> str:
 
 def code(text: str) -> str:
     """Text as a Markdown code span that is safe in a table cell."""
-    shown = one_line(text).replace("|", r"\|")
-    fence = _fence(shown, 1)
-    return f"{fence}{shown}{fence}" if "`" not in shown else f"{fence} {shown} {fence}"
+    line = one_line(text).replace("|", r"\|")
+    fence, space = _fence(line, 1), " " * ("`" in line)
+    return f"{fence}{space}{line}{space}{fence}"
 
 
 def code_block(lines: list[str], language: str) -> list[str]:
     """Lines as a fenced Markdown block, with a fence longer than any in the text."""
-    shown = list(map(one_line, lines))
-    fence = _fence("\n".join(shown), 3)
-    return [f"{fence}{language}", *shown, fence]
+    cleaned = list(map(one_line, lines))
+    fence = _fence("\n".join(cleaned), 3)
+    return [f"{fence}{language}", *cleaned, fence]
 
 
 def table_lines(head: Sequence[str], rows: Iterable[Iterable[object]], left: Collection[int] = (0,)) -> Iterator[str]:
@@ -50,8 +50,8 @@ def _fence(text: str, least: int) -> str:
 
 def plain(text: str, width: int | None = None) -> str:
     """Escape text for matplotlib (no $math$, no leading underscore, which hides a label); wrap to `width`."""
-    shown = one_line(text)
-    lines = textwrap.wrap(shown, width, break_long_words=True) if width else [shown]
+    cleaned = one_line(text)
+    lines = textwrap.wrap(cleaned, width, break_long_words=True) if width else [cleaned]
     joined = "\n".join(lines).replace("$", r"\$")
     return f" {joined}" if joined.startswith("_") else joined
 

@@ -23,15 +23,9 @@ Sharing = Literal["window", "observation"]
 
 
 def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
-    """Shift images by up to `pad` pixels in each direction.
+    """Shift (N, ..., H, W) uint8 images by up to `pad` pixels in each direction; 0 returns `obs`.
 
-    Args:
-        obs: (N, ..., H, W) uint8; all images under one leading index get the same shift.
-        key: (N,) int64 random keys, one per shift.
-        pad: largest shift in pixels; 0 returns `obs`.
-
-    Returns:
-        Tensor like `obs`.
+    `key` are (N,) int64; all images under one leading index get the same shift.
     """
     if pad == 0:
         return obs

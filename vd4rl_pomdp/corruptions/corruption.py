@@ -94,10 +94,8 @@ class Patch(Options):
             raise UserError(
                 f"patch size {self.patch_size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
             )
-        square = torch.arange(self.patch_count, device=key.device)
-        draw = (0 if self.patch_shared else number[..., None] * self.patch_count) + square.expand(
-            *number.shape, self.patch_count
-        )
+        square = torch.arange(self.patch_count, device=key.device).expand(*number.shape, self.patch_count)
+        draw = (0 if self.patch_shared else number[..., None] * self.patch_count) + square
         top = draw_numbered(key, height - self.patch_size + 1, draw)
         # Hash the key again, or rows and columns would be the same draws.
         return top, draw_numbered(hash_keys(key), width - self.patch_size + 1, draw)
@@ -116,10 +114,7 @@ class FrameDrop(Options, ABC):
 
     @abstractmethod
     def order(self, key: Tensor, stack: int) -> Tensor:
-        """Priority (N, stack) int64 of each frame, oldest first in the row; the lowest are zeroed, in ties the older.
-
-        `key` are (N,) int64 random keys.
-        """
+        """Priority (N, stack) int64 of each frame, oldest first, from (N,) int64 keys; in ties the older is zeroed."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +134,9 @@ class ZeroFrames(FrameDrop):
     def dropped(self, stack: int) -> int:
         """See `FrameDrop`."""
         if self.zeroed_frames > stack - self.keep_newest:
-            kept = " and keep the newest" if self.keep_newest else ""
+            newest = " and keep the newest" if self.keep_newest else ""
             raise UserError(
-                f"cannot zero {self.zeroed_frames} of {stack} stacked frames{kept}: choose a smaller --zeroed-frames"
+                f"cannot zero {self.zeroed_frames} of {stack} stacked frames{newest}: choose a smaller --zeroed-frames"
             )
         return self.zeroed_frames
 
@@ -178,12 +173,8 @@ class Truncate(FrameDrop):
 
 
 def _is_stage(part: Any) -> bool:
-    changes = isinstance(part, type) and issubclass(part, Options) and any("__call__" in vars(c) for c in part.__mro__)
-    return changes or _drops(part)
-
-
-def _drops(part: Any) -> bool:
-    return isinstance(part, type) and issubclass(part, FrameDrop)
+    options = isinstance(part, type) and issubclass(part, Options)
+    return options and (issubclass(part, FrameDrop) or any("__call__" in vars(kind) for kind in part.__mro__))
 
 
 def _refuse_stage(name: str, kind: type[Options]) -> None:
@@ -211,8 +202,8 @@ def _kinds(corruption: str) -> list[type[Options]]:
     """Stage classes of a corruption, such as [Patch, ZeroFrames]; UserError for an unknown or repeated name."""
     names = [] if corruption == "none" else corruption.split("+")
     kinds = [STAGES.named(name) for name in dict.fromkeys(names)]
-    if len(kinds) < len(names) or any(map(_drops, kinds[:-1])):
-        last = " or ".join(name for name, kind in STAGES.items() if _drops(kind))
+    if len(kinds) < len(names) or any(issubclass(kind, FrameDrop) for kind in kinds[:-1]):
+        last = " or ".join(name for name, kind in STAGES.items() if issubclass(kind, FrameDrop))
         raise UserError(
             f"unknown corruption {corruption!r}: join stages with +, each at most once, with {last} only at the end"
         )
@@ -235,13 +226,7 @@ class CorruptionConfig(Options):
     def of(cls, corruption: str = "none", corruption_mode: Mode = "resample", **options: Any) -> Self:
         """Build a config by name, such as `CorruptionConfig.of("patch+zero_frames", patch_size=32)`.
 
-        Args:
-            corruption: stage names joined by `+`.
-            corruption_mode: see the field.
-            options: values of the stages' options by name.
-
-        Raises:
-            UserError: an unknown or repeated name, an option that no stage has, or one that two stages have.
+        UserError for an unknown or repeated name, an option that no stage has, or one that two stages have.
         """
         config = cls.fill({"corruption": corruption, "corruption_mode": corruption_mode} | options)
         known = flat(config)
@@ -285,17 +270,9 @@ class Corruption:
         self._by_pixel = all(tells_pixels(stage) for stage in stages)
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
-        """Corrupted copy of a batch.
+        """Corrupted copy of (..., C, H, W) uint8 stacks; `obs` itself if the corruption is "none".
 
-        Args:
-            obs: (..., C, H, W) uint8, C = 3 * stacked frames.
-            key: (...,) int64 on the same device, one per stack; equal keys give equal masks.
-
-        Returns:
-            uint8 like `obs`; `obs` itself (no copy) if the corruption is "none".
-
-        Raises:
-            UserError: keys of another shape or dtype.
+        `key` are (...,) int64 on the same device, one per stack; equal keys give equal masks. UserError for others.
         """
         if self._nothing:
             return obs
@@ -322,14 +299,7 @@ class Corruption:
         return obs
 
     def paint(self, frames: Tensor, index: Tensor, key: Tensor, shift_key: Tensor, pad: int) -> Tensor | None:
-        """Gather, shift and corrupt frames in one fused pass.
-
-        Args:
-            frames: (R, C, H, W) uint8.
-            index: (N, S) int64, frame numbers of each stack.
-            key: (N,) int64 corruption keys, one per stack.
-            shift_key: (M,) int64 shift keys, each shared by N / M consecutive stacks.
-            pad: largest shift in pixels.
+        """Gather, shift and corrupt frames in one fused pass; arguments as of `fused.drawn` and `fused.painted`.
 
         Returns:
             (N, S * C, H, W) uint8; None if nothing changes, or if a stage does not implement `Hiding`.

@@ -78,7 +78,7 @@ def drawn(
     """Draw shifts, dropped frames and masks.
 
     Args:
-        stages: stages, each `Hiding`.
+        stages: each `Hiding`.
         drop: a `FrameDrop` or None.
         dropped: number of frames per stack that it drops.
         pad: largest shift in pixels.
@@ -113,7 +113,7 @@ def painted(
     """Compute stacks (N, S * C, H, W) uint8 from the draws of `drawn`.
 
     Args:
-        stages: stages, each `Hiding`.
+        stages: each `Hiding`.
         frames: (R, C, H, W) uint8.
         index: (N, S) int64, frame numbers of each stack.
         offset, kept, places: see `StackDraws`.

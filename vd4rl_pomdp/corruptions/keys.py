@@ -37,8 +37,7 @@ def _mix(key: Any) -> Any:
 
 
 def _shift_right(x: Any, bits: int) -> Any:
-    """Logical right shift of int64."""
-    # `>>` is arithmetic: mask out the copies of the sign bit.
+    # logical: `>>` is arithmetic, so mask out the copies of the sign bit
     return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 

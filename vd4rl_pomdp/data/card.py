@@ -1,7 +1,4 @@
-"""Write a data set's card, `card.md` and `card.png`, from what its own files record.
-
-V-D4RL's files are not needed for it; published scores come from `data.folder.published_scores`.
-"""
+"""Write a data set's card, `card.md` and `card.png`, from what its own files record."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError, disk_error
+from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.core.text import code, markdown, plain, write_text
 from vd4rl_pomdp.core.types import StepType
@@ -50,17 +47,7 @@ HOW = {
 
 
 def write_card(path: Path) -> Path:
-    """Write `card.md` and `card.png` to a data set's folder.
-
-    Args:
-        path: folder of all shards, collected by this package or published.
-
-    Returns:
-        Path of card.md.
-
-    Raises:
-        UserError: `path` is not a folder or not writable, or the data set is damaged or incomplete.
-    """
+    """Write `card.md`, whose path is returned, and `card.png`; UserError for a damaged, incomplete or read-only set."""
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)
@@ -69,6 +56,7 @@ def write_card(path: Path) -> Path:
     rows = join_shards(path, shards, parts)
     attributes = [read_attributes(shard) for shard in shards]
     names = task_and_quality(path, attributes)
+    title = ", ".join(name for name in names if name) or "data set"
     starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
     returns = episode_returns(rows["reward"], starts)
     lengths = np.diff([*starts, len(rows["reward"])])
@@ -76,12 +64,28 @@ def write_card(path: Path) -> Path:
     # plain behaviour cloning is the published score closest to the data's own mean return
     published = float(scores[0]) * SCORE_DIVISOR if scores else None
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
-    text = _text(path, names, attributes, returns, lengths, published)
-    try:
-        (path / "card.png").write_bytes(_picture(names, returns, published, film))
+    table = {
+        "episodes": len(returns),
+        "rows": int(lengths.sum()),
+        "rows an episode": " to ".join(str(length) for length in dict.fromkeys([lengths.min(), lengths.max()])),
+        "return, mean": f"{returns.mean():.3f}",
+        "return, standard deviation": f"{returns.std():.3f}",
+        "return, lowest to highest": f"{returns.min():.3f} to {returns.max():.3f}",
+        "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
+        "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
+    }
+    memory = {f"memory under {one['name']}": certificate_in_words(one) for one in read_certificates([path]).values()}
+    table |= memory or {"memory": NOT_CERTIFIED}
+    lines = [f"| {name} | {markdown(str(value))} |" for name, value in table.items()]
+    lines += [f"| {name} | {value} |" for name, value in _origin(path, attributes).items()]
+    how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
+    if source := dict(attributes[0].get("imported", {})):
+        how = f"Imported from {source.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in source.items()))}."
+    head = [f"# {markdown(title)}", "", how, "", "| | |", "|---|---|"]
+    text = "\n".join([*head, *lines, "", "![Returns and a film strip](card.png)", ""])
+    with disk_errors(path / "card.md"):
+        (path / "card.png").write_bytes(_picture(title, returns, published, film))
         write_text(path / "card.md", text)
-    except OSError as error:
-        raise disk_error(path / "card.md", error) from error
     return path / "card.md"
 
 
@@ -90,19 +94,17 @@ def _film(
 ) -> np.ndarray:
     """Evenly spaced frames (FILM_FRAMES, 3, S, S) of the episode with the median return."""
     episode = int(np.argsort(returns)[len(returns) // 2])
-    wanted = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
+    rows = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
     offsets = np.cumsum([0, *counts])
     frames = []
     for shard, first, stop in zip(shards, offsets, offsets[1:], strict=False):
-        inside = np.unique(wanted[(wanted >= first) & (wanted < stop)])
+        inside = np.unique(rows[(rows >= first) & (rows < stop)])
         if len(inside):
             frames.append(read_some_frames(shard, inside - first))
     return np.concatenate(frames)
 
 
-def _picture(
-    names: tuple[str | None, str | None], returns: np.ndarray, published: float | None, film: np.ndarray
-) -> bytes:
+def _picture(title: str, returns: np.ndarray, published: float | None, film: np.ndarray) -> bytes:
     from matplotlib.figure import Figure  # slow to load
 
     figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
@@ -113,7 +115,7 @@ def _picture(
     if published is not None:
         label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
         above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
-    above.set(xlabel="episode return", ylabel="episodes", title=plain(_title(names)))
+    above.set(xlabel="episode return", ylabel="episodes", title=plain(title))
     above.set(xlim=(edges[0], edges[-1]), ylim=(0, counts.max() / LINES))
     above.yaxis.get_major_locator().set_params(integer=True)
     above.spines[["top", "right"]].set_visible(False)
@@ -126,51 +128,14 @@ def _picture(
     return buffer.getvalue()
 
 
-def _title(names: tuple[str | None, str | None]) -> str:
-    return ", ".join(name for name in names if name) or "data set"
-
-
-def _text(
-    path: Path,
-    names: tuple[str | None, str | None],
-    attributes: list[dict[str, Any]],
-    returns: np.ndarray,
-    lengths: np.ndarray,
-    published: float | None,
-) -> str:
-    rows = {
-        "episodes": len(returns),
-        "rows": int(lengths.sum()),
-        "rows an episode": " to ".join(str(length) for length in dict.fromkeys([lengths.min(), lengths.max()])),
-        "return, mean": f"{returns.mean():.3f}",
-        "return, standard deviation": f"{returns.std():.3f}",
-        "return, lowest to highest": f"{returns.min():.3f} to {returns.max():.3f}",
-        "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
-        "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
-    }
-    memory = {f"memory under {one['name']}": certificate_in_words(one) for one in read_certificates([path]).values()}
-    rows |= memory or {"memory": NOT_CERTIFIED}
-    lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
-    table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())
-    how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
-    if told := dict(attributes[0].get("imported", {})):
-        how = f"Imported from {told.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in told.items()))}."
-    return (
-        f"# {markdown(_title(names))}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
-    )
-
-
 def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
     """Seed, actors, rendering, versions and commit from the data set's files, as Markdown by name."""
-    if not attributes[0]:
-        return {}
     first = attributes[0]
-    actors = {a["policy"]: a.get("actor_sha256") for a in attributes if a.get("actor_sha256")}
     facts = {"seed": first.get("seed"), "render": first.get("render")}
     facts["noise added to actions, standard deviation"] = first.get("action_noise")
-    facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
+    facts |= {f"actor {a['policy']}, SHA-256": a["actor_sha256"] for a in attributes if a.get("actor_sha256")}
     record = path / PROVENANCE
-    if record.exists():
+    if first and record.exists():
         provenance = read_json(record)
         if not all(isinstance(provenance.get(name, {}), dict) for name in ("render", "versions")):
             raise UserError(f"{record}: is damaged; remove it, and the card goes without it")
@@ -180,5 +145,8 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
         facts["versions"] = ", ".join(f"{k} {v}" for k, v in provenance.get("versions", {}).items())
         facts["commit"] = provenance.get("git_commit")
         facts["command"] = provenance.get("command")
-    shown = {markdown(name): str(value) for name, value in facts.items() if value not in (None, "")}
-    return {name: code(value) if name == "command" else markdown(value) for name, value in shown.items()}
+    return {
+        markdown(name): (code if name == "command" else markdown)(str(value))
+        for name, value in facts.items()
+        if value not in (None, "")
+    }

@@ -16,17 +16,9 @@ from vd4rl_pomdp.data.format import read_dtypes
 from vd4rl_pomdp.data.store import verify_store
 from vd4rl_pomdp.envs.mazes import MAZES
 
-ReplayFn = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
-"""(task, physics (P,) of an episode's first row, actions (T, A), a_0 first) -> rewards (T,), r_0 first."""
 
-
-def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn | None = None) -> dict[str, Any]:
-    """Validate a data set and describe it.
-
-    Args:
-        path: folder of shards, or one file, of a task or a maze.
-        cache: folder of decoded data sets, as in `open_dataset`.
-        replay: function that simulates an episode; default `envs.dmc.replay_rewards`.
+def check_dataset(path: Path | str, cache: Path | None = None) -> dict[str, Any]:
+    """Validate a data set of a task or a maze, and describe it; arguments as `open_dataset`.
 
     Returns:
         JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `episodes_of_one_row` (not used in
@@ -44,23 +36,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     verify_store(dataset.store)
     _check_actions(dataset)
     returns = dataset.returns.numpy()
-    attributes, states = dataset.store.meta["attributes"][0], dataset.physics
-    replayed, reason = None, "every episode, from its first simulator state"
-    if states is None:
-        reason = "impossible: the set stores no simulator states"
-    elif attributes.get("task") in MAZES:
-        from vd4rl_pomdp.envs.maze import replay_states
-
-        maze, repeat = attributes["task"], attributes["action_repeat"]
-        replayed = _replay_error(dataset, states, lambda state, action: replay_states(maze, state, action, repeat))
-    elif refusal := _why_not_replayed(dataset):
-        reason = refusal
-    else:
-        from vd4rl_pomdp.envs.dmc import replay_rewards
-
-        assert dataset.task is not None
-        played = partial(replay or replay_rewards, dataset.task)
-        replayed = _replay_error(dataset, dataset.store.array("reward"), played)
+    replayed, reason = _replayed(dataset)
     shards = [path] if path.is_file() else [path / name for name in dataset.store.meta["shards"]]
     dtypes = [read_dtypes(shard) for shard in shards]
     return {
@@ -97,29 +73,33 @@ def _check_actions(dataset: Dataset) -> None:
         raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], as policies act")
 
 
-def _why_not_replayed(dataset: Dataset) -> str:
-    """Why the rewards of a data set with states cannot be replayed; "" if they can."""
-    dataset.require_states()
-    assert dataset.task is not None
-    task = TASKS.named(dataset.task)
-    if not isinstance(task, DMCTask):
-        return f"impossible: {dataset.task} is not a task of dm_control"
-    from vd4rl_pomdp.envs.dmc import replays
+def _replayed(dataset: Dataset) -> tuple[float | None, str]:
+    """`replay_max_error` and `replay` of `check_dataset`."""
+    attributes, physics = dataset.store.meta["attributes"][0], dataset.physics
+    if physics is None:
+        return None, "impossible: the set stores no simulator states"
+    replay: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    if (maze := attributes.get("task")) in MAZES:
+        from vd4rl_pomdp.envs.maze import replay_states
 
-    return "" if replays(task) else f"impossible: {dataset.task} draws more than the simulator state for each episode"
+        stored, replay = physics, partial(replay_states, maze, action_repeat=attributes["action_repeat"])
+    else:
+        from vd4rl_pomdp.envs import dmc
 
-
-def _replay_error(
-    dataset: Dataset, stored: np.ndarray, replay: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> float:
-    """Largest absolute difference between the `stored` rows and `replay`(first state, actions) over all episodes."""
-    assert dataset.physics is not None
+        dataset.require_states()
+        assert dataset.task is not None
+        task = TASKS.named(dataset.task)
+        if not isinstance(task, DMCTask):
+            return None, f"impossible: {dataset.task} is not a task of dm_control"
+        if not dmc.replays(task):
+            return None, f"impossible: {dataset.task} draws more than the simulator state for each episode"
+        stored, replay = dataset.store.array("reward"), partial(dmc.replay_rewards, dataset.task)
     action, worst = dataset.store.array("action"), 0.0
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
         if end - start == 1:
             continue
         try:
-            replayed = replay(dataset.physics[start], action[start + 1 : end])
+            replayed = replay(physics[start], action[start + 1 : end])
         except UserError:
             raise
         except (RuntimeError, ValueError) as error:  # from dm_control, for example if the simulation diverges
@@ -128,4 +108,4 @@ def _replay_error(
                 f"({first_line(error)}); put the dataset in a folder named after its task, or collect it again"
             ) from error
         worst = np.maximum(worst, np.abs(replayed - stored[start + 1 : end]).max())  # unlike max(), propagates NaN
-    return float(worst)
+    return float(worst), "every episode, from its first simulator state"

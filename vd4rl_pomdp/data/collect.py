@@ -6,7 +6,7 @@ command resumes an interrupted collection and produces the same files.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -83,19 +83,15 @@ class _Job:
     seed: int
     actor: Actor | None
     render: Render
-    size: int | None
-    """Height and width of the frames; None: no rendering."""
+    size: int | None  # None: no rendering
     length: int | None
     noise: float
-    """Standard deviation of the noise on actions."""
 
 
 def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
     """Collect a data set, or its missing shards; returns all shards.
 
-    Args:
-        config: the settings.
-        length: time limit in decisions, for tests and demos; None: the task's.
+    `length` is the time limit in decisions, for tests and demos; None: the task's.
     """
     check_config(config)
     refuse_inside(config.out)
@@ -145,7 +141,7 @@ def check_config(config: CollectConfig) -> None:
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     refuse_outside(config, action_noise=(0, MAX_NOISE), frame_size=FRAME_SIZES)
     refuse_unknown("quality to collect", config.quality, SET_QUALITIES)
-    base = _base(config)
+    base = config.quality.removesuffix("_noisy")
     layout = layout_of(task)  # also refuses an environment that cannot be built
     if not layout.state_dim and base != "random":
         raise UserError(f"{config.task} has no states for an actor to read: use --quality random, or your own dataset")
@@ -163,36 +159,18 @@ def check_config(config: CollectConfig) -> None:
         raise UserError(f"{config.task} has no action_noise: use --quality {base} with --action-noise")
 
 
-def _base(config: CollectConfig) -> str:
-    """The quality without "_noisy"."""
-    return config.quality.removesuffix("_noisy")
-
-
 def _noise(config: CollectConfig) -> float:
-    """Standard deviation of the noise on actions."""
     own = TASKS.named(config.task).action_noise if config.quality in NOISY_QUALITIES else None
     return own or config.action_noise or 0.0
 
 
-def _suffix(config: CollectConfig) -> str:
-    """Suffix for action noise in the names of data set and shards, such as "_noise0.3"."""
-    if config.quality in NOISY_QUALITIES:
-        return "_noisy"
-    return f"_noise{config.action_noise:g}" if config.action_noise else ""
-
-
 def set_quality(config: CollectConfig) -> str:
     """The quality recorded in the data set and in runs on it, including noise: "medium_noise0.3"."""
-    return _base(config) + _suffix(config)
+    return config.quality + (f"_noise{config.action_noise:g}" if config.action_noise else "")
 
 
 def play(config: CollectConfig, length: int | None = None) -> Iterator[EpisodeArrays]:
-    """Yield the episodes of `collect` without rendering or writing: the same seeds, actions and rewards.
-
-    Args:
-        config: the settings; `out` is not touched.
-        length: time limit in decisions; None: the task's.
-    """
+    """Yield the episodes of `collect` without rendering or writing: the same seeds, actions and rewards."""
     jobs = [
         replace(_job(config, collector, episode, length), size=None)
         for _, episodes, collector in _plan(config)
@@ -206,7 +184,9 @@ def play(config: CollectConfig, length: int | None = None) -> Iterator[EpisodeAr
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
     """Yield each shard's file, episode numbers and policy; for medium_expert all medium shards come first."""
-    halves = ["medium", "expert"] if _base(config) == "medium_expert" else [_base(config)]
+    base = config.quality.removesuffix("_noisy")
+    halves = ["medium", "expert"] if base == "medium_expert" else [base]
+    suffix = set_quality(config).removeprefix(base)
     first = 0
     for number, quality in enumerate(halves):
         stop = config.episodes * (number + 1) // len(halves)
@@ -217,20 +197,18 @@ def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
             collector = read_actor(config.actor, config.task) if config.actor else load_actor(config.task, quality)
         for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
             episodes = range(start, min(start + config.episodes_per_shard, stop))
-            yield config.out / f"{shard}_{config.task}_{quality}{_suffix(config)}.hdf5", episodes, collector
+            yield config.out / f"{shard}_{config.task}_{quality}{suffix}.hdf5", episodes, collector
         first = stop
 
 
 def _job(config: CollectConfig, collector: Collector, episode: int, length: int | None = None) -> _Job:
     """Job of one episode. With a ladder, episode i of n uses the actor at (i + 0.5) / n of its training run."""
-    # The middle of the episode's share of the training run.
     actor = collector.actor_at((episode + 0.5) / config.episodes) if isinstance(collector, Ladder) else collector
     task, size = TASKS.named(config.task), config.frame_size
     return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
 
 
 def _roll_out(job: _Job) -> EpisodeArrays:
-    """Play one episode; returns its rows by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
     # A separate stream, so that the actor's samples are the same with and without noise.
@@ -259,7 +237,5 @@ def _roll_out(job: _Job) -> EpisodeArrays:
     }
 
 
-@cache
-def _environment(*arguments: Any) -> Any:
-    """Environment, cached per process, so that all its episodes share one GL context."""
-    return make_env(*arguments)
+_environment: Callable[..., Any] = cache(make_env)
+"""Per process, so that all its episodes share one GL context."""

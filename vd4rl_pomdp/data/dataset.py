@@ -25,24 +25,15 @@ Index = int | Sequence[int] | np.ndarray | Tensor
 def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
     """Open a V-D4RL data set: a folder of shards, or a single shard.
 
-    The first call decodes it into a cache; later calls memory-map that and take well under a second.
-
-    Args:
-        path: folder of shards, or one file.
-        cache: folder of decoded data sets; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
-
-    Raises:
-        UserError: it is missing, empty, damaged, incomplete, part of a published data set, or has frames of two sizes.
+    The first call decodes it into `cache`, by default `$VD4RL_POMDP_CACHE` or the user's cache folder; later calls
+    memory-map that. UserError for one that is missing, damaged, incomplete, or with frames of two sizes.
     """
     path = Path(path)
     return Dataset(path, open_store(path, Path(cache) if cache else None))
 
 
 class Dataset:
-    """Rows and episodes of a V-D4RL data set; create it with `open_dataset`.
-
-    All tensors are on one device. Frames are a read-only memory map shared with other processes until `to` moves them.
-    """
+    """Rows and episodes of a V-D4RL data set, all tensors on one device; create it with `open_dataset`."""
 
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
@@ -60,7 +51,7 @@ class Dataset:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # it is only read
             self.frames = torch.from_numpy(store.frames())
-        """(N, 3, S, S) uint8, a read-only memory map: writing to it crashes the process."""
+        """(N, 3, S, S) uint8; until `to`, a read-only memory map shared with other processes: writing to it crashes."""
         self.action = torch.from_numpy(store.array("action"))
         """(N, A) float32: row t holds a_{t-1}."""
         self.reward = torch.from_numpy(reward.astype(np.float32))
@@ -121,12 +112,12 @@ class Dataset:
 
     def require_states(self) -> None:
         """Raise UserError if the data set has no simulator states, or its task is unknown."""
-        if self.physics is not None and self.task is None:
-            raise UserError(f"{self.path}: has physics but names no task; put it in a folder named after its task")
         if self.physics is None:
             raise UserError(
                 f"{self.path}: stores no simulator states; `data collect` stores those of dm_control's tasks"
             )
+        if self.task is None:
+            raise UserError(f"{self.path}: has physics but names no task; put it in a folder named after its task")
 
     def rows_of(self, episode: int | range) -> slice:
         """Rows of one episode, or of a range of consecutive episodes."""
@@ -149,11 +140,7 @@ class Dataset:
         return StateScale.fit(states, pose.shape[1])
 
     def to(self, device: torch.device | str) -> Dataset:
-        """Move frames and rows to a device, in place; returns the data set.
-
-        Raises:
-            UserError: the device's memory is too small.
-        """
+        """Move frames and rows to a device, in place; UserError if its memory is too small."""
         try:
             for name, value in vars(self).items():
                 if isinstance(value, Tensor):
@@ -187,8 +174,7 @@ class Dataset:
     def actions_before(self, rows: Tensor) -> Tensor:
         """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero at the first, where the history starts."""
         actions = self.action[rows]
-        # The stored action was taken before the window.
-        actions[..., 0, :] = 0
+        actions[..., 0, :] = 0  # the stored action was taken before the window
         return actions
 
     def stack_rows(self, rows: Tensor, frame_stack: int) -> Tensor:
@@ -231,28 +217,18 @@ class Dataset:
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows within an episode; errors as `check_windows`."""
-        return self._counted(length)[0]
-
-    def _counted(self, length: int) -> tuple[int, Tensor]:
-        """Entry of `_windows` for a length, computed if needed."""
         if length not in self._windows:
             self.check_windows(length)
             ends = self.windows_per_episode(length).cumsum(0)
             self._windows[length] = int(ends[-1]), ends
-        return self._windows[length]
+        return self._windows[length][0]
 
     def window_rows(self, index: Index, length: int) -> Tensor:
-        """Rows (B, length) int64 of windows.
+        """Rows (B, length) int64 of windows; errors as `check_windows`, and IndexError for an index out of range.
 
-        Args:
-            index: (B,) window numbers in 0..num_windows(length)-1, counting all possible starts in order.
-            length: rows per window.
-
-        Raises:
-            UserError: an episode is shorter than the window.
-            IndexError: an index is out of range.
+        `index` (B,) are window numbers in 0..num_windows(length)-1, counting all possible starts in order.
         """
-        count, ends = self._counted(length)
+        count, ends = self.num_windows(length), self._windows[length][1]
         number, per_episode = self._index(index, count), self.windows_per_episode(length)
         # Window numbers run through all episodes; the cumulative counts `ends` locate a number's episode.
         episode = torch.searchsorted(ends, number, right=True)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shutil
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from huggingface_hub import hf_hub_download, hf_hub_url
 from huggingface_hub.errors import HTTPError
@@ -28,15 +27,6 @@ def default_endpoint() -> str:
     return os.environ.get("HF_ENDPOINT") or HUB
 
 
-def check_endpoint(endpoint: str, name: str) -> None:
-    """Raise UserError unless `endpoint`, given by the flag or variable `name`, is an http(s) address."""
-    with suppress(ValueError):
-        parts = urlsplit(endpoint)
-        if parts.scheme in ("http", "https") and parts.hostname:
-            return
-    raise UserError(f"{name} {endpoint!r} is not an address; it must start with https:// or http://")
-
-
 def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:
     """Raise UserError for a task or quality without a published data set."""
     published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
@@ -49,55 +39,43 @@ def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:
 def download(
     task: str, quality: str, destination: Path, endpoint: str | None = None, verify: bool = False
 ) -> list[Path]:
-    """Download one data set into `destination/{task}/{quality}/84px`; existing files are not downloaded again.
+    """Download one data set into `destination/{task}/{quality}/84px`; returns its shards.
+
+    Existing files are not downloaded again; files equal to another data set's below `destination` are hard-linked.
 
     Args:
-        task: task name.
-        quality: one of `tasks.QUALITIES`.
-        destination: folder of all downloaded data sets; files equal to another data set's there are hard-linked.
         endpoint: address of the Hub or a mirror, without `/datasets`; None: `default_endpoint`.
         verify: also check the SHA-256 of existing files; by default only their size is checked.
-
-    Returns:
-        The data set's shards.
-
-    Raises:
-        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, a full disk, or another
-            process is downloading the data set.
     """
     check_published([task], [quality])
     endpoint = default_endpoint() if endpoint is None else endpoint
-    check_endpoint(endpoint, "endpoint")
+    if not re.match(r"https?://(\w|\[[0-9a-fA-F:]+\])", endpoint):
+        raise UserError(f"endpoint {endpoint!r} is not an address; it must start with https:// or http://")
     refuse_kept(destination)
-    wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
-    if lacking := [file for file in wanted if not _is_there(file, file.target(destination), verify)]:
-        beside = destination / f".{task}_{quality}.download"
-        with owned(beside), disk_errors(destination):
-            for file in lacking:
-                _provide(file, destination, beside, endpoint.rstrip("/"))
-        shutil.rmtree(beside, ignore_errors=True)
-    return [file.target(destination) for file in wanted]
+    published = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
+    if missing := [file for file in published if not _is_there(file, file.target(destination), verify)]:
+        scratch = destination / f".{task}_{quality}.download"
+        with owned(scratch), disk_errors(destination):
+            for file in missing:
+                target = file.target(destination)
+                others = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
+                twin = next((path for path in others if path != target and _is_there(file, path, verify=True)), None)
+                fresh = scratch / target.name if twin else _fetch(file, scratch, endpoint.rstrip("/"))
+                if twin:
+                    fresh.unlink(missing_ok=True)
+                    try:
+                        os.link(twin.resolve(), fresh)
+                    except OSError:  # not every file system supports hard links
+                        shutil.copyfile(twin, fresh)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                fresh.replace(target)
+        shutil.rmtree(scratch, ignore_errors=True)
+    return [file.target(destination) for file in published]
 
 
 def _is_there(file: RemoteFile, path: Path, verify: bool) -> bool:
     """Whether a file is complete. Only verified files get their final name, so by default the size suffices."""
     return path.is_file() and path.stat().st_size == file.size and (not verify or sha256(path) == file.sha256)
-
-
-def _provide(file: RemoteFile, destination: Path, beside: Path, endpoint: str) -> None:
-    """Create a file at its target: link an equal one of another data set, or download it; both are verified."""
-    target = file.target(destination)
-    others = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
-    twin = next((path for path in others if path != target and _is_there(file, path, verify=True)), None)
-    fresh = beside / target.name if twin else _fetch(file, beside, endpoint)
-    if twin:
-        fresh.unlink(missing_ok=True)
-        try:
-            os.link(twin.resolve(), fresh)
-        except OSError:  # not every file system supports hard links
-            shutil.copyfile(twin, fresh)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    fresh.replace(target)
 
 
 def _fetch(file: RemoteFile, folder: Path, endpoint: str) -> Path:

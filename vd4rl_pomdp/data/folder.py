@@ -100,7 +100,20 @@ def shard_paths(folder: Path) -> list[Path]:
         hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a dataset there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
     _refuse_part(folder, shards)
-    _refuse_misnumbered(folder, shards)
+    alike: dict[str, dict[int | None, Path]] = defaultdict(dict)
+    for shard in sorted(shards):
+        rest, number = _shard_number(shard)
+        if twin := alike[rest].get(number):
+            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are the same shard; remove one")
+        alike[rest][number] = shard
+    for rest, found in alike.items():
+        numbers = sorted(number for number in found if number is not None)
+        if numbers != list(range(len(numbers))):
+            missing = min(set(range(len(numbers))) - set(numbers))
+            raise UserError(
+                f"{folder}: has the shard {numbers[-1]}{rest}, but not {missing}{rest}; download or collect it again, "
+                "or number the shards of your own dataset 0, 1, 2, ..."
+            )
     return sorted(shards, key=_shard_order)
 
 
@@ -116,24 +129,6 @@ def _shard_order(path: Path) -> tuple[list[tuple[int, str]], int]:
     return words, -1 if number is None else number
 
 
-def _refuse_misnumbered(folder: Path, shards: Sequence[Path]) -> None:
-    """Raise UserError unless shards of the same name are numbered 0, 1, 2, ... without gaps and duplicates."""
-    alike: dict[str, dict[int | None, Path]] = defaultdict(dict)
-    for shard in sorted(shards):
-        rest, number = _shard_number(shard)
-        if twin := alike[rest].get(number):
-            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are the same shard; remove one")
-        alike[rest][number] = shard
-    for rest, found in alike.items():
-        numbers = sorted(number for number in found if number is not None)
-        if numbers != list(range(len(numbers))):
-            lacking = min(set(range(len(numbers))) - set(numbers))
-            raise UserError(
-                f"{folder}: has the shard {numbers[-1]}{rest}, but not {lacking}{rest}; download or collect it again, "
-                "or number the shards of your own dataset 0, 1, 2, ..."
-            )
-
-
 def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
     """Raise UserError if some shards of a published data set are missing.
 
@@ -141,15 +136,15 @@ def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
     attributes by this package.
     """
     task, quality = task_and_quality(path, [])
-    wanted = [file.path.rpartition("/")[2] for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
+    published = [file.path.rpartition("/")[2] for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
     names = {shard.name for shard in shards}
-    missing = [name for name in wanted if name not in names]
-    if not missing or not names <= set(wanted) or read_attributes(shards[0]):
+    missing = [name for name in published if name not in names]
+    if not missing or not names <= set(published) or read_attributes(shards[0]):
         return
     out = path.parents[2] if path.parts[-3:] == (task, quality, "84px") else "DIR"
     command = f"vd4rl-pomdp data download --task {task} --quality {quality} --out {out}"
     raise UserError(
-        f"{path}: is a part of V-D4RL's {task} {quality}, {len(shards)} of {len(wanted)} shards ({missing[0]} is "
+        f"{path}: is a part of V-D4RL's {task} {quality}, {len(shards)} of {len(published)} shards ({missing[0]} is "
         f"missing); get the rest with `{command}`, or rename the shards to train on them alone"
     )
 
@@ -174,31 +169,43 @@ def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices:
 
 
 def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Concatenate the rows of all shards.
-
-    Args:
-        path: the data set, or a single shard.
-        shards: its files, from `shard_paths`.
-        parts: their rows, from `read_rows`.
+    """Concatenate the rows `parts`, from `read_rows`, of all shards of the data set at `path`.
 
     Raises:
-        UserError: the shards differ in dimensions or keys, an episode's start is missing, or the number of episodes
-            differs from that in collection.json.
+        UserError: the shards differ in dimensions or keys, a row neither starts an episode nor continues that of the
+            previous row, or the number of episodes differs from that in collection.json.
     """
     first, expected = shards[0], parts[0]
     for shard, part in zip(shards, parts, strict=True):
         if expected.keys() != part.keys():
             key = min(expected.keys() ^ part.keys())
-            having, lacking = (shard, first) if key in part else (first, shard)
-            raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one dataset per folder")
+            having, other = (shard, first) if key in part else (first, shard)
+            raise UserError(f"{having}: has {key!r}, {other.name} has not; keep one dataset per folder")
         for key, value in part.items():
             if value.shape[1:] != expected[key].shape[1:]:
                 widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
                 raise UserError(f"{shard}: {key!r} has {widths}; keep one dataset per folder")
     starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    _check_order(shards, starts, rows["step_type"])
-    check_count(path, int((rows["step_type"] == StepType.FIRST).sum()))
+    step_type = rows["step_type"]
+
+    def fail(row: int, what: str) -> None:
+        shard = int(np.searchsorted(starts, row, side="right")) - 1
+        place = f"{shards[shard]}: row {row - starts[shard]}"
+        raise UserError(f"{place} {what}; is a shard before this one missing or renamed?")
+
+    if step_type[0] != StepType.FIRST:
+        fail(0, f"has step_type {step_type[0]}, but the first row of a set begins an episode")
+    strays = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
+    if len(strays):
+        fail(int(strays[0]), "follows an episode's last row without beginning a new one")
+    for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
+        (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
+        # without numbers, shards are assumed to be consecutive
+        adjacent = before is None or number is None or (rest == previous_rest and number == before + 1)
+        if step_type[row] != StepType.FIRST and not adjacent:
+            fail(int(row), f"continues an episode, but not that of {previous.name}")
+    check_count(path, int((step_type == StepType.FIRST).sum()))
     return rows
 
 
@@ -213,36 +220,10 @@ def check_count(path: Path, episodes: int) -> None:
         )
 
 
-def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarray) -> None:
-    """Raise UserError unless every row starts an episode or continues the previous row's."""
-
-    def fail(row: int, what: str) -> None:
-        shard = int(np.searchsorted(starts, row, side="right")) - 1
-        raise UserError(f"{shards[shard]}: row {row - starts[shard]} {what}")
-
-    missing = "; is a shard before this one missing or renamed?"
-    if step_type[0] != StepType.FIRST:
-        fail(0, f"has step_type {step_type[0]}, but the first row of a set begins an episode{missing}")
-    astray = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
-    if len(astray):
-        fail(int(astray[0]), f"follows an episode's last row without beginning a new one{missing}")
-    for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
-        (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
-        # without numbers, shards are assumed to be consecutive
-        adjacent = before is None or number is None or (rest == previous_rest and number == before + 1)
-        if step_type[row] != StepType.FIRST and not adjacent:
-            fail(int(row), f"continues an episode, but not that of {previous.name}{missing}")
-
-
 def episode_returns(reward: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Undiscounted returns of all episodes.
+    """Undiscounted returns (E,) of rewards (N,) float64 and first rows (E,) of all episodes.
 
-    Args:
-        reward: (N,) float64; rewards at first rows, which follow no action, are ignored.
-        starts: (E,) int64, first row of every episode.
-
-    Returns:
-        (E,) float64.
+    Rewards at first rows, which follow no action, are ignored.
     """
     paid = reward.copy()
     paid[starts] = 0.0

@@ -39,15 +39,10 @@ _REPAIR = "download or collect it again"
 
 
 def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
-    """Write one shard atomically. Equal input gives equal bytes.
+    """Write one shard atomically (one writer at a time). Equal input gives equal bytes.
 
-    Args:
-        path: the shard's file; it is written to a hidden file next to it and renamed. One writer at a time.
-        rows: arrays by key, of equal length, as in the module's table; converted to its dtypes.
-        attributes: JSON values to store with the shard: `task`, `set` (the quality), seed, versions.
-
-    Raises:
-        UserError: frames are not uint8, the disk is full or the folder not writable; no partial file remains.
+    `rows` are arrays by key, of equal length, as in the module's table; they are converted to its dtypes, but UserError
+    for frames that are not uint8. `attributes` are JSON values: `task`, `set` (the quality), seed, versions.
     """
     if (dtype := np.asarray(rows.get(FRAMES_KEY, np.uint8(0))).dtype) != np.uint8:
         raise UserError(f"{path}: {FRAMES_KEY} is {dtype}; frames must be uint8, from 0 to 255")
@@ -80,43 +75,35 @@ def read_dtypes(path: Path) -> dict[str, str]:
 
 def read_frame_size(shards: Sequence[Path]) -> int:
     """Height and width S of a data set's frames; UserError for another shape or dtype, or for two sizes."""
-    sizes = [_frame_size(path) for path in shards]
-    for path, size in zip(shards, sizes, strict=True):
-        if size != sizes[0]:
-            raise UserError(
-                f"{path}: has frames of {size}x{size} pixels, {shards[0].name} of {sizes[0]}x{sizes[0]}; keep one "
-                "dataset per folder"
-            )
-    return sizes[0]
-
-
-def _frame_size(path: Path) -> int:
     low, high = FRAME_SIZES
-    with _open(path) as file:
-        _keys(path, file)
-        frames = file[FRAMES_KEY]
-        shape = frames.shape
+    first = 0
+    for path in shards:
+        with _open(path) as file:
+            _keys(path, file)
+            frames = file[FRAMES_KEY]
+            shape, dtype = frames.shape, frames.dtype
         square = shape == (*shape[:1], 3, *shape[-1:] * 2) and shape[0] and low <= shape[-1] <= high
-        if frames.dtype != np.uint8 or not square:
+        if dtype != np.uint8 or not square:
             raise UserError(
-                f"{path}: 'observation' is {frames.dtype} of shape {shape}, expected square uint8 frames (N, 3, S, S) "
+                f"{path}: 'observation' is {dtype} of shape {shape}, expected square uint8 frames (N, 3, S, S) "
                 f"of {low} to {high} pixels; convert them, or choose another dataset"
             )
-        return shape[-1]
+        size = shape[-1]
+        first = first or size
+        if size != first:
+            raise UserError(
+                f"{path}: has frames of {size}x{size} pixels, {shards[0].name} of {first}x{first}; keep one dataset "
+                "per folder"
+            )
+    return first
 
 
 def read_rows(path: Path) -> dict[str, np.ndarray]:
     """Read and validate everything in a shard except its frames.
 
-    Args:
-        path: the shard.
-
     Returns:
         action (N, A) float32, reward and discount (N,) float64, step_type (N,) uint8, and physics (N, P) float64 if
         the shard has it.
-
-    Raises:
-        UserError: the file is truncated, not HDF5, lacks a key, or has a wrong shape, dtype or value.
     """
     read_frame_size([path])
     with _open(path) as file:
@@ -131,13 +118,25 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
 def check_rows(place: Path | str, rows: Mapping[str, np.ndarray], count: int) -> None:
     """Raise UserError, naming `place`, unless `rows` hold `count` rows with valid shapes, dtypes and values."""
     for key, value in rows.items():
-        _check_column(place, key, value, count)
+        if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
+            expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"
+            raise UserError(f"{place}: {key!r} has shape {value.shape}, expected {expected}; {_REPAIR}")
+        if key == "step_type":
+            if value.dtype.kind not in "iuf" or not np.isin(value, [int(s) for s in StepType]).all():
+                raise UserError(f"{place}: 'step_type' holds values other than 0, 1 and 2; {_REPAIR}")
+            continue
+        if value.dtype.kind != "f":
+            raise UserError(f"{place}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
+        # Not `> _LARGEST`, which is False for NaN.
+        bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
+        if len(bad):
+            rows_text = f"row {bad[0]} ({len(bad)} such rows)"
+            raise UserError(f"{place}: {key!r} is not finite as float32 in {rows_text}; {_REPAIR}")
     # first rows, which follow no step, may store any discount
     outside = ((rows["discount"] < 0) | (rows["discount"] > 1)) & (rows["step_type"] != StepType.FIRST)
     if outside.any():
         row = int(outside.argmax())
-        told = rows["discount"][row]
-        raise UserError(f"{place}: 'discount' is {told!s} in row {row}, not within 0 and 1; {_REPAIR}")
+        raise UserError(f"{place}: 'discount' is {rows['discount'][row]!s} in row {row}, not within 0 and 1; {_REPAIR}")
 
 
 def read_frames(path: Path) -> Iterator[np.ndarray]:
@@ -165,53 +164,31 @@ def _open(path: Path) -> Iterator[h5py.File]:
     except UserError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
+            raise UnavailableError(
+                f"{path}: another program writes it, or its disk has no locks ({os.strerror(error.errno).lower()}); "
+                "close that program and re-run the same command, or set HDF5_USE_FILE_LOCKING=FALSE to read without "
+                "locks"
+            ) from error
+        if "already open for write" in str(error):
+            raise UnavailableError(
+                f"{path}: another program writes it, or was killed while it did; close that program and re-run the "
+                "same command, or remove its mark with `h5clear -s`"
+            ) from error
         damaged = UserError(f"{path}: is truncated, damaged or not an HDF5 file ({in_one_line(error)}); {_REPAIR}")
-        raise _locked(path, error) or system_error(path, error) or damaged from error
-
-
-def _locked(path: Path, error: Exception) -> UserError | None:
-    """Error for a shard that is locked, or marked by HDF5 as open for writing; None for other errors."""
-    if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
-        return UnavailableError(
-            f"{path}: another program writes it, or its disk has no locks ({os.strerror(error.errno).lower()}); close "
-            "that program and re-run the same command, or set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
-        )
-    if "already open for write" in str(error):
-        return UnavailableError(
-            f"{path}: another program writes it, or was killed while it did; close that program and re-run the same "
-            "command, or remove its mark with `h5clear -s`"
-        )
-    return None
+        raise system_error(path, error) or damaged from error
 
 
 def _keys(path: Path, file: h5py.File) -> list[str]:
     """Keys of the format that are in a file; UserError if one is missing, no array, or stored in another file."""
-    wanted = [FRAMES_KEY, *_ROW_KEYS]
-    keys = [key for key in wanted if key != _OPTIONAL or file.get(key, getlink=True) is not None]
+    keys = [k for k in (FRAMES_KEY, *_ROW_KEYS) if k != _OPTIONAL or file.get(k, getlink=True) is not None]
     for key in keys:
-        elsewhere = isinstance(file.get(key, getlink=True), h5py.ExternalLink)
-        stored = file[key] if not elsewhere and key in file else None  # `file.get` hides a failing disk
+        external = isinstance(file.get(key, getlink=True), h5py.ExternalLink)
+        stored = file[key] if not external and key in file else None  # `file.get` hides a failing disk
         if isinstance(stored, h5py.Dataset):
-            elsewhere = stored.external is not None or stored.is_virtual
-        if elsewhere:
+            external = stored.external is not None or stored.is_virtual
+        if external:
             raise UserError(f"{path}: {key!r} is stored in another file, which is not supported; {_REPAIR}")
         if not isinstance(stored, h5py.Dataset) or stored.shape is None:  # HDF5's null datasets have no shape
             raise UserError(f"{path}: has no {key!r}, so it is not a V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
     return keys
-
-
-def _check_column(path: Path | str, key: str, value: np.ndarray, count: int) -> None:
-    """Raise UserError for a wrong shape, dtype or value of one key."""
-    if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
-        expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"
-        raise UserError(f"{path}: {key!r} has shape {value.shape}, expected {expected}; {_REPAIR}")
-    if key == "step_type":
-        if value.dtype.kind not in "iuf" or not np.isin(value, [int(s) for s in StepType]).all():
-            raise UserError(f"{path}: 'step_type' holds values other than 0, 1 and 2; {_REPAIR}")
-        return
-    if value.dtype.kind != "f":
-        raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
-    # Not `> _LARGEST`, which is False for NaN.
-    bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
-    if len(bad):
-        raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")

@@ -30,23 +30,27 @@ _OFF_BY = 8
 _STATIC_STD = 2.0
 
 
-def canary_frames(task: str, render: Render = "exact") -> np.ndarray:
-    """The golden states rendered on this machine: (F, 3, 84, 84) uint8."""
-    return _show_golden_states(task, _golden_env(task, render))
+def canary_frames(task: str, render: Render = "exact", env: DMCEnv | None = None) -> np.ndarray:
+    """The golden states rendered on this machine, in `env` if given: (F, 3, 84, 84) uint8."""
+    env = env or _golden_env(task, render)
+    camera, frames = FrameCamera(env.physics), []
+    for state in _golden()[f"{task}/physics"]:
+        start_from(env.simulator, state)
+        frames.append(camera.frame())
+    return np.stack(frames)
 
 
 def render_info(task: str = CANARY) -> dict[str, Any]:
     """Describe this machine's rendering: mujoco version, GL vendor and renderer, and the hash of the canary frames.
 
-    Args:
-        task: name of the task. For one without golden frames CANARY's are used; for one that is not dm_control's the
-            result is only Gymnasium's version.
+    For a task without golden frames CANARY's are used; for one that is not dm_control's the result is only Gymnasium's
+    version.
     """
     if not isinstance(TASKS.get(task), DMCTask | None):
         return {"gymnasium": gymnasium.__version__}
     task = task if task in golden_tasks() else CANARY
     env = _golden_env(task, "exact")  # its GL context must live while its strings are read
-    frames = _show_golden_states(task, env)
+    frames = canary_frames(task, env=env)
     return {"mujoco": mujoco.__version__, **gl_strings(), "canary": frames_hash(frames)}
 
 
@@ -65,10 +69,7 @@ def compare(rendered: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
 
 
 def check_parity(path: Path | None = None) -> dict[str, Any]:
-    """Compare canary frames with golden ones, and a data set's static background with the environment's.
-
-    Args:
-        path: a data set; None: compare only the canaries.
+    """Compare canary frames with golden ones, and the static background of a data set, if any, with the environment's.
 
     Returns:
         `render`, `canary` (a comparison per task), `background` (a comparison, or None), and `equal`: the background's
@@ -85,16 +86,12 @@ def _compare_background(path: Path) -> dict[str, Any]:
     """Compare the median frames of data and environment on the pixels that are static in both."""
     dataset = open_dataset(path)
     if dataset.task is None:
-        raise UserError(
-            f"{path}: cannot tell the task; put the dataset in a folder named after it, such as walker_walk/"
-        )
+        raise UserError(f"{path}: cannot tell the task; put the dataset in a folder named after it (walker_walk/)")
     rows = np.linspace(0, dataset.num_rows - 1, min(dataset.num_rows, 400)).astype(int)
     data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task, dataset.frame_size)
     static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)
     if not static.any():
-        raise UserError(
-            f"{path}: no pixel is static in both the dataset and the environment; its frames are not this task's"
-        )
+        raise UserError(f"{path}: no pixel is static in both dataset and environment; its frames are not this task's")
     result = compare(np.median(ours, 0)[static], np.median(data, 0)[static])
     return {"task": dataset.task, "static_pixels": int(static.sum()), **result}
 
@@ -119,14 +116,6 @@ def _golden_env(task: str, render: Render) -> DMCEnv:
     played = TASKS.named(task)
     assert isinstance(played, DMCTask), "Gymnasium environments have no golden frames"
     return DMCEnv(played, render)
-
-
-def _show_golden_states(task: str, env: DMCEnv) -> np.ndarray:
-    camera, frames = FrameCamera(env.physics), []
-    for state in _golden()[f"{task}/physics"]:
-        start_from(env.simulator, state)
-        frames.append(camera.frame())
-    return np.stack(frames)
 
 
 @cache

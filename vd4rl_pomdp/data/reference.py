@@ -9,8 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import build
+from vd4rl_pomdp.core.reading import build, damaged
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.dataset import Dataset
 from vd4rl_pomdp.policies.actor import shipped_file
@@ -38,7 +37,13 @@ class Reference:
     def of(cls, dataset: Dataset) -> Self:
         """Reference of a data set; the path error is added after training."""
         rewards = float(dataset.returns.sum()) / dataset.num_transitions
-        return cls(round(float(dataset.returns.mean()), 4), _sole_actor(dataset), mean_reward=round(rewards, 6))
+        hashes = {one.get("actor_sha256") for one in dataset.store.meta["attributes"]}
+        actor = None
+        if len(hashes) == 1 and dataset.task is not None and dataset.task in TASKS:
+            known = {"task": dataset.task, "quality": "", "sha256": str(hashes.pop())}
+            candidates = (known | {"quality": quality} for quality in ("medium", "expert"))
+            actor = next((one for one in candidates if shipped_file(**one)), None)
+        return cls(round(float(dataset.returns.mean()), 4), actor, mean_reward=round(rewards, 6))
 
     @classmethod
     def read(cls, run: Path) -> Self:
@@ -49,14 +54,12 @@ class Reference:
     @classmethod
     def parse(cls, path: Path, stored: dict[str, Any]) -> Self:
         """Parse a file's content; UserError, naming the file, if it is damaged."""
-        try:
-            told = {"mean_reward": None} | stored  # missing in earlier runs
-            made = build(cls, {field.name: told[field.name] for field in fields(cls)})
-            if made.actor is not None and made.actor.keys() != {"task", "quality", "sha256"}:
-                raise ValueError(f"{made.actor!r} names no actor")
-            return made
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{path}: is damaged ({error}); remove it to compare the run with no data") from error
+        with damaged(path, "is damaged", "remove it to compare the run with no data"):
+            values = {"mean_reward": None} | stored  # missing in earlier runs
+            reference = build(cls, {field.name: values[field.name] for field in fields(cls)})
+            if reference.actor is not None and reference.actor.keys() != {"task", "quality", "sha256"}:
+                raise ValueError(f"{reference.actor!r} names no actor")
+            return reference
 
     def with_path_error(self, error: float | None) -> Reference:
         """A copy with the path error of a trained policy."""
@@ -78,29 +81,13 @@ class Reference:
         return float(np.mean(np.array(returns) > REACHED * self.data_return))
 
 
-def action_error(action: np.ndarray, shown: np.ndarray) -> np.floating:
+def action_error(action: np.ndarray, actors: np.ndarray) -> np.floating:
     """Mean squared difference between (..., A) actions and the actor's, in their precision."""
-    return np.square(action - shown).mean()
-
-
-def _sole_actor(dataset: Dataset) -> dict[str, str] | None:
-    """The shipped actor that collected all shards; None if there is no such single actor."""
-    hashes = {one.get("actor_sha256") for one in dataset.store.meta["attributes"]}
-    if len(hashes) != 1 or dataset.task is None or dataset.task not in TASKS:
-        return None
-    sha256 = str(hashes.pop())
-    for quality in ("medium", "expert"):
-        if shipped_file(dataset.task, quality, sha256):
-            return {"task": dataset.task, "quality": quality, "sha256": sha256}
-    return None
+    return np.square(action - actors).mean()
 
 
 def summarise(rows: list[dict[str, Any]], reference: Reference) -> dict[str, float | None]:
-    """Summary of one policy's episodes under one corruption; None if unknown.
-
-    Returns:
-        `score_mean`, `score_min`, `score_max`, `return_mean`, `share_above_80` (see `Reference`), `action_error`.
-    """
+    """Summary of one policy's episodes under one corruption: scores, returns, `share_above_80`; None if unknown."""
     scores, returns = ([row[name] for row in rows] for name in ("score", "return"))
     errors = [row["action_error"] for row in rows if row["action_error"] is not None]
     return {

@@ -46,9 +46,6 @@ def collect_set(
     """Write a data set's missing files: collection.json with its settings first, then shards, then provenance.json.
 
     Args:
-        out: folder of the data set.
-        settings: the settings that identify it.
-        shards: all shards of the data set.
         roll_out: plays a job and returns its rows by key.
         workers: number of processes; 0: one per core.
         title: title of the progress bar, and its unit, such as ("collect", "episodes").
@@ -60,11 +57,19 @@ def collect_set(
     with owned(out):
         missing = [shard for shard in shards if not shard.path.exists()]
         stored, whole = read_plan(out), (out / PROVENANCE).exists()
-        _claim(out, settings, stored, whole)
+        if not stored and holds_anything(out):
+            raise UserError(f"{out}: is not empty and holds no collected dataset; choose another --out")
+        if stored and (others := differing(stored, settings)):
+            raise UserError(f"{out}: holds a dataset that differs in {', '.join(others)}; choose another --out")
+        if stored and not whole and (parts := of_other_code(stored, settings)):
+            raise UserError(
+                f"{out}: is unfinished, and the code of {parts[0]} has changed since; restore it, or choose another "
+                "--out"
+            )
         if whole and not missing:
             return
         rendered = _rendered_by(out, task, stored if len(missing) < len(shards) else {}) if task else {}
-        code = {name: told for name, told in code_of(settings).items() if told}
+        code = {name: parts for name, parts in code_of(settings).items() if parts}
         write_json(out / PLAN, settings | code | {"rendered_by": rendered})
         started, frames = time.monotonic(), 0
         with ProgressLine(title[0], sum(len(shard.jobs) for shard in missing), title[1]) as progress:
@@ -82,28 +87,16 @@ def collect_set(
         write_json(out / PROVENANCE, spent | {"workers": count_workers(workers)} | origin)
 
 
-def _claim(out: Path, settings: dict[str, Any], stored: dict[str, Any], whole: bool) -> None:
-    """Raise UserError unless a folder is empty or holds this data set; an unfinished one must be of the same code."""
-    if not stored and holds_anything(out):
-        raise UserError(f"{out}: is not empty and holds no collected dataset; choose another --out")
-    if stored and (others := differing(stored, settings)):
-        raise UserError(f"{out}: holds a dataset that differs in {', '.join(others)}; choose another --out")
-    if stored and not whole and (parts := of_other_code(stored, settings)):
-        raise UserError(
-            f"{out}: is unfinished, and the code of {parts[0]} has changed since; restore it, or choose another --out"
-        )
-
-
 def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]:
     """This machine's renderer; UserError if existing shards were rendered with other pixels."""
     from vd4rl_pomdp.data.parity import render_info
 
     now, before = render_info(task), stored.get("rendered_by", {})
     if stored and before.get("canary") != now.get("canary"):
-        drew, here = (told.get("gl_renderer") or "another renderer" for told in (before, now))
+        first, here = (info.get("gl_renderer") or "another renderer" for info in (before, now))
         raise UserError(
-            f"{out}: its shards were rendered by {drew}, and {here} renders other pixels: resume on a machine like the "
-            "first, or choose another --out"
+            f"{out}: its shards were rendered by {first}, and {here} renders other pixels: resume on a machine like "
+            "the first, or choose another --out"
         )
     return now
 

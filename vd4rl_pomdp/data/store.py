@@ -74,6 +74,12 @@ class Store:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
         return self._load(f"{key}.npy", np.load)
 
+    def physics(self) -> np.ndarray | None:
+        """Simulator states (N, P) float64, memory-mapped read-only; None if the data set has none."""
+        if "physics.npy" not in self.meta["files"]:
+            return None
+        return self._load("physics.npy", partial(np.load, mmap_mode="r"))
+
     def _load(self, name: str, read: Callable[[Path], np.ndarray]) -> np.ndarray:
         try:
             return read(self.folder / name)
@@ -84,12 +90,6 @@ class Store:
         """Error for a cached file that is damaged or was changed."""
         return UserError(f"{self.folder / name}: is damaged; delete {self.folder} to decode the dataset again")
 
-    def physics(self) -> np.ndarray | None:
-        """Simulator states (N, P) float64, memory-mapped read-only; None if the data set has none."""
-        if "physics.npy" not in self.meta["files"]:
-            return None
-        return self._load("physics.npy", partial(np.load, mmap_mode="r"))
-
 
 def default_cache() -> Path:
     """Folder of decoded data sets: $VD4RL_POMDP_CACHE, else the user's cache folder."""
@@ -99,11 +99,7 @@ def default_cache() -> Path:
 
 
 def open_store(path: Path, cache: Path | None = None) -> Store:
-    """Open the decoded form of the data set at `path`, decoding it first if needed.
-
-    Raises:
-        UserError: the data set is missing, damaged, incomplete or has two frame sizes, or the cache is not writable.
-    """
+    """Open the decoded form of the data set at `path`, decoding it first if needed; errors as `open_dataset`."""
     with disk_errors(path):
         shards = shard_paths(path)
         stats = [(path.resolve().as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in shards]
@@ -167,17 +163,20 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         scratch.mkdir()
-        needed, free = len(rows["reward"]) * 3 * frame_size**2, shutil.disk_usage(scratch).free
-        if needed > free:
-            wanted, there = told_apart(needed / 1e9, free / 1e9, 1)
+        count = len(rows["reward"])
+        size, free = count * 3 * frame_size**2, shutil.disk_usage(scratch).free
+        if size > free:
+            needed, available = told_apart(size / 1e9, free / 1e9, 1)
             raise DiskFullError(
-                f"{folder.parent}: decoding needs {wanted} GB, the disk has {there} GB; "
+                f"{folder.parent}: decoding needs {needed} GB, the disk has {available} GB; "
                 "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
             )
-        _write_frames(shards, scratch / _FRAMES, len(rows["reward"]))
+        _write_frames(shards, scratch / _FRAMES, count)
         for key, value in rows.items():
             np.save(scratch / f"{key}.npy", value)
-        meta = _describe(shards, scratch, len(rows["reward"]))
+        files = {p.name: {"bytes": p.stat().st_size, "blake2b": _checksum(p)} for p in sorted(scratch.iterdir())}
+        attributes = [read_attributes(shard) for shard in shards]
+        meta = {"rows": count, "shards": [s.name for s in shards], "attributes": attributes, "files": files}
         (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
         # The last step, so that a killed process leaves no incomplete folder.
@@ -198,12 +197,6 @@ def _write_frames(shards: Sequence[Path], path: Path, rows: int) -> None:
                 file.write(block.data)
                 if progress:
                     progress.advance(len(block))
-
-
-def _describe(shards: Sequence[Path], scratch: Path, rows: int) -> dict[str, Any]:
-    files = {p.name: {"bytes": p.stat().st_size, "blake2b": _checksum(p)} for p in sorted(scratch.iterdir())}
-    attributes = [read_attributes(shard) for shard in shards]
-    return {"rows": rows, "shards": [s.name for s in shards], "attributes": attributes, "files": files}
 
 
 def _checksum(path: Path) -> str:

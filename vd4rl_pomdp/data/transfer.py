@@ -52,26 +52,20 @@ def import_set(
     Args:
         name: name of the format in `FORMATS`.
         source: path or name of the data set.
-        out: folder to write.
         task: task name, if the source does not state it or to override it.
-        quality: name of the behaviour policy.
         size: height and width to resize images to, by area averaging; None: no resizing.
         picture: name of the observation that holds the images, if there are several.
         clip_actions: whether actions outside the source's bounds are clipped; otherwise they are refused.
-
-    Raises:
-        UserError: the source is missing, damaged or has no images, actions are out of bounds, or the folder holds
-            something else.
     """
     refuse_inside(out)
-    with _telling(source):
+    with _errors_of(source):
         opened = _resized(FORMATS.named(name).read(source, picture), size)
         if not opened.episodes:
             raise UserError("holds no episodes")
     own = next((value for value in opened.record.values() if isinstance(value, str)), name)
     # without a known task, its label (also used in file names) is made from the source's own name
     label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
-    _tell(opened.notes)
+    _print(opened.notes)
     settings: dict[str, Any] = {
         "format": name,
         "source": opened.record,
@@ -90,14 +84,14 @@ def import_set(
         for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
-    with _without_a_trace(out):
+    with _removing_if_empty(out):
         try:
             collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
         except UserError:
-            if episodes.asked and not any(shard.path.exists() for shard in shards):
+            if episodes.called and not any(shard.path.exists() for shard in shards):
                 (out / PLAN).unlink(missing_ok=True)
             raise
-    _tell(episodes.notes())
+    _print(episodes.notes())
     from vd4rl_pomdp.data.card import write_card  # draws
 
     write_card(out)
@@ -105,11 +99,7 @@ def import_set(
 
 
 def export_set(name: str, path: Path, out: Path, size: int | None = None) -> None:
-    """Convert a data set of this package to another format; `size` as in `import_set`.
-
-    Raises:
-        UserError: the format is read-only, the data set is damaged, or `out` is not empty.
-    """
+    """Convert a data set of this package to another format; `size` as in `import_set`."""
     form = FORMATS.named(name)
     if form.write is None:
         writable = [other for other, one in FORMATS.items() if one.write]
@@ -119,8 +109,8 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another --out")
     opened = _resized(read_shards(str(path)), size)
-    whole = Path(os.path.abspath(out))  # Minari loses the files of a relative path
-    hidden = whole.with_name(f".{whole.name}.export")
+    absolute = Path(os.path.abspath(out))  # Minari loses the files of a relative path
+    hidden = absolute.with_name(f".{absolute.name}.export")
     progress = ProgressLine("export", opened.episodes, "episodes")
 
     def read(first: int) -> Iterator[EpisodeArrays]:
@@ -129,7 +119,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
             progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
     # `owned` locks the hidden folder, so that no other process removes it
-    with _without_a_trace(hidden, True), disk_errors(out), owned(hidden), progress:
+    with _removing_if_empty(hidden, True), disk_errors(out), owned(hidden), progress:
         shutil.rmtree(hidden / "set", ignore_errors=True)  # left by a killed process
         try:
             lost = form.write(hidden / "set", out, replace(opened, read=read))
@@ -138,11 +128,11 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
             (hidden / "set").rename(out)
         finally:
             shutil.rmtree(hidden / "set", ignore_errors=True)
-    _tell(lost)
+    _print(lost)
 
 
 @contextmanager
-def _without_a_trace(folder: Path, ours: bool = False) -> Iterator[None]:
+def _removing_if_empty(folder: Path, ours: bool = False) -> Iterator[None]:
     """On exit remove `folder` and its parents if empty and created in the block (`folder` always, if `ours`)."""
     made = [one for one in (folder, *folder.parents) if not one.exists() or (ours and one == folder)]
     try:
@@ -154,7 +144,7 @@ def _without_a_trace(folder: Path, ours: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def _telling(place: str) -> Iterator[None]:
+def _errors_of(place: str) -> Iterator[None]:
     """Turn errors of a format's reader or library into one-line UserErrors that name `place`."""
     try:
         yield
@@ -177,11 +167,11 @@ class _Reader:
         self._layout: dict[str, tuple[int, ...]] = {}
         self._last = np.zeros(0, np.uint8)  # last image of the previous episode
         self._clipped = self._read = self._still = self._joined = 0
-        self.asked = False
+        self.called = False
 
     def __call__(self, number: int) -> EpisodeArrays:
-        self.asked = True
-        with _telling(f"{self._name}: episode {number}"):
+        self.called = True
+        with _errors_of(f"{self._name}: episode {number}"):
             if number != self._next:
                 self._episodes = self._source.read(number)
             rows = next(self._episodes, None)
@@ -192,14 +182,14 @@ class _Reader:
                 raise UserError("has no step: remove it from the source")
             rows = rows | {"action": self._scaled(rows["action"])}
             if frames.shape[2:] != size:
-                here, there = (f"{height}x{width}" for height, width in (frames.shape[2:], size))
-                raise UserError(f"has images of {here} pixels, its dataset declares {there}")
+                found, declared = (f"{height}x{width}" for height, width in (frames.shape[2:], size))
+                raise UserError(f"has images of {found} pixels, its dataset declares {declared}")
             layout = {key: values.shape[1:] for key, values in rows.items()}
             if frames.dtype != np.uint8 or layout != (self._layout or layout):
                 raise UserError(f"has {frames.dtype} images and rows of {layout}, unlike the episodes before")
             self._layout = layout
-            others = {key: values for key, values in rows.items() if key != FRAMES_KEY}
-            check_rows(f"{self._name}: episode {number}", others, len(frames))
+            states = {key: values for key, values in rows.items() if key != FRAMES_KEY}
+            check_rows(f"{self._name}: episode {number}", states, len(frames))
             self._read += 1
             self._still += np.array_equal(frames[1], frames[0]) and bool((frames[1:] == frames[0]).all())
             self._joined += number == self._next and np.array_equal(frames[0], self._last)
@@ -220,19 +210,16 @@ class _Reader:
         low, high = self._source.action_low, self._source.action_high
         scaled = action.astype(np.float32)
         if low is not None and high is not None and not ((low == -1).all() and (high == 1).all()):
-            scaled = ((action.astype(np.float64) - low) / np.where(high > low, high - low, 1) * 2 - 1).astype(
-                np.float32
-            )
+            share = (action.astype(np.float64) - low) / np.where(high > low, high - low, 1)
+            scaled = (share * 2 - 1).astype(np.float32)
             scaled[0] = 0
-        most = float(np.abs(scaled).max())
-        if most > 1 + _ROUNDING:
-            if not self._clip:
-                told = "its bounds" if low is not None else "[-1, 1], and the source has no bounds"
-                raise UserError(
-                    f"has actions outside {told} (up to {most:.4g} after scaling); --clip-actions clips them"
-                )
-            self._clipped += int((np.abs(scaled) > 1 + _ROUNDING).any(1).sum())
-        return scaled if most <= 1 else scaled.clip(-1, 1)
+        outside = (np.abs(scaled) > 1 + _ROUNDING).any(1)
+        if outside.any() and not self._clip:
+            bounds = "its bounds" if low is not None else "[-1, 1], and the source has no bounds"
+            most = np.abs(scaled).max()
+            raise UserError(f"has actions outside {bounds} (up to {most:.4g} after scaling); --clip-actions clips them")
+        self._clipped += int(outside.sum())
+        return scaled.clip(-1, 1)
 
 
 def _resized(source: SourceSet, size: int | None) -> SourceSet:
@@ -259,6 +246,6 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
     return replace(source, read=read, frame_shape=(size, size), notes=[*source.notes, note])
 
 
-def _tell(notes: Iterable[str]) -> None:
+def _print(notes: Iterable[str]) -> None:
     for note in notes:
         print(f"note: {note}", file=sys.stderr)

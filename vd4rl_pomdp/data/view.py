@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, get_args
 
@@ -21,7 +22,14 @@ from vd4rl_pomdp.data.dataset import Dataset, Index
 
 
 class View:
-    """A data set with the random shift and corruption applied to its observations, and their random streams."""
+    """A data set with the random shift and corruption applied to its observations, and their random streams.
+
+    Args:
+        shift: largest random shift in pixels.
+        name: name of the view's random streams, which distinguishes the views of a run.
+        frame_stack: frames per observation.
+        shared: whether all observations of a window get the same shift, or only the frames of one observation.
+    """
 
     def __init__(
         self,
@@ -33,17 +41,6 @@ class View:
         frame_stack: int = FRAME_STACK,
         shared: Sharing = "window",
     ) -> None:
-        """Initialise.
-
-        Args:
-            dataset: the data set; batches are on its device.
-            corruption: config or name of the corruption; None: none.
-            shift: largest random shift in pixels.
-            seed: the run's seed.
-            name: name of the view's random streams, which distinguishes the views of a run.
-            frame_stack: frames per observation.
-            shared: whether all observations of a window get the same shift, or only the frames of one observation.
-        """
         refuse_unknown("sharing", shared, get_args(Sharing))
         refuse_number("frame_stack", frame_stack, 1)
         self.dataset = dataset
@@ -52,14 +49,10 @@ class View:
         self._pad, self._frame_stack, self._shared = shift, frame_stack, shared
 
     def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
-        """Observations of rows. On a CPU, with a shift, frames that the corruption zeroes are never read.
+        """Observations (N, ..., C, H, W) uint8, C = 3 * frame_stack, of rows (N, ...) int64.
 
-        Args:
-            rows: (N, ...) int64; all observations under one leading index get the same shift if `shared` is "window".
-            shift_key: (N,) int64 keys of the shifts; None: the next keys of the view's stream.
-
-        Returns:
-            (N, ..., C, H, W) uint8, C = 3 * frame_stack.
+        `shift_key` are (N,) int64 keys of the shifts; None: the next of the view's stream. On a CPU, with a
+        shift, frames that the corruption zeroes are never read.
         """
         if shift_key is None:
             shifts = len(rows) if self._shared == "window" else rows.numel()
@@ -113,13 +106,13 @@ class View:
         """
         data = self.dataset
         end = data.episode_end[data.episode[first], None]
-        there = first[:, None] + torch.arange(length, device=first.device)
-        rows, obs = torch.minimum(there, end - 1), self.observe(first[:, None])
+        unpadded = first[:, None] + torch.arange(length, device=first.device)
+        rows, obs = torch.minimum(unpadded, end - 1), self.observe(first[:, None])
         return Windows(
             obs=obs.expand(-1, length, *obs.shape[2:]),
-            prev_action=data.actions_before(rows) * (there < end)[..., None],
+            prev_action=data.actions_before(rows) * (unpadded < end)[..., None],
             action=data.action_or_zero(rows),
-            has_action=there + 1 < end,
+            has_action=unpadded + 1 < end,
             length=(end[:, 0] - first).clamp(max=length),
             key=data.keys(rows),
         )
@@ -127,13 +120,8 @@ class View:
     def transitions(self, index: Index, n_step: int = 1, gamma: float = 0.99) -> Transitions:
         """n-step transitions; `obs` and `next_obs` are shifted and corrupted independently.
 
-        Args:
-            index: (B,) transition numbers in 0..num_transitions-1, counting the rows with a successor, in order.
-            n_step: number of rewards to sum, fewer at an episode's end; see `Dataset.n_step_returns`.
-            gamma: discount between the summed rewards.
-
-        Raises:
-            IndexError: an index is out of range.
+        `index` (B,) are transition numbers in 0..num_transitions-1, counting the rows with a successor, in order;
+        IndexError for others. `n_step` and `gamma` as in `Dataset.n_step_returns`.
         """
         data, rows = self.dataset, self.dataset.rows_of_transitions(index)
         reward, discount, next_rows = data.n_step_returns(rows, n_step, gamma)
@@ -163,20 +151,29 @@ class View:
         keys = keys.flatten()
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
-        # One more image than chosen: the zero frame for `_spread`.
+        # One more image than chosen: the zero frame.
         images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
         # Frames with the same shift key are consecutive.
-        offset = augmentation.draw_offset(shift_key, self._pad).repeat_interleave(
-            chosen.numel() // max(1, len(shift_key)), 0
-        )
-        augmentation.shift_by_lines(frames, chosen.flatten(), offset, images[:-1])
-        corruption.change_(images[:-1].view(*chosen.shape, *images.shape[1:]), keys, kept)
-        obs = images[:-1] if kept.shape[1] == stack else _spread(images, kept, stack)
+        repeats = chosen.numel() // max(1, len(shift_key))
+        offset = augmentation.draw_offset(shift_key, self._pad).repeat_interleave(repeats, 0)
+        obs = images[:-1]
+        augmentation.shift_by_lines(frames, chosen.flatten(), offset, obs)
+        corruption.change_(obs.view(*chosen.shape, *images.shape[1:]), keys, kept)
+        if kept.shape[1] < stack:  # put the frames at their places `kept` (N, K) of otherwise zero stacks
+            images[-1] = 0
+            source = torch.full((len(kept), stack), kept.numel())
+            source.scatter_(1, kept, torch.arange(kept.numel()).view(kept.shape))
+            out = BUFFERS.take((source.numel(), *images.shape[1:]))
+            obs = torch.index_select(images, 0, source.flatten(), out=out)
         return obs.view(*rows.shape, stack * images.shape[1], *images.shape[2:])
 
 
 class StateView(View):
-    """Simulator states instead of pixels, as the input of an encoder of states."""
+    """Simulator states instead of pixels, as the input of an encoder of states.
+
+    `observed` is `StateFrame.observe`: (..., P) states and (...,) int64 keys -> (..., P, 1, 1) observations. Of the
+    corruption only its mode is used, to draw the keys; its stages change pixels.
+    """
 
     def __init__(
         self,
@@ -186,15 +183,6 @@ class StateView(View):
         seed: int,
         *name: str | int,
     ) -> None:
-        """Initialise.
-
-        Args:
-            dataset: a data set with simulator states.
-            observed: `StateFrame.observe`: (..., P) states and (...,) int64 keys -> (..., P, 1, 1) observations.
-            corruption: only its mode is used, to draw the keys; its stages change pixels.
-            seed: the run's seed.
-            name: name of the view's random streams.
-        """
         super().__init__(dataset, corruption, 0, seed, *name)
         self._states, self._observed = dataset.states(), observed
 
@@ -203,17 +191,8 @@ class StateView(View):
         return self._observed(self._states[rows], self.corruption.keys(self.dataset.keys(rows)))
 
 
-def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
-    """Put frames at places `kept` (N, K) of otherwise zero stacks; the last of `images` becomes the zero frame."""
-    images[-1] = 0
-    source = torch.full((len(kept), stack), kept.numel())
-    source.scatter_(1, kept, torch.arange(kept.numel()).view(kept.shape))
-    out = BUFFERS.take((source.numel(), *images.shape[1:]))
-    return torch.index_select(images, 0, source.flatten(), out=out)
-
-
-class Sampler:
-    """Base class of samplers: a view (if a data set is given, of its stored pixels), a batch size, a random stream.
+class Sampler(ABC):
+    """Samples batches uniformly over the data set, with replacement.
 
     Random numbers are drawn on the CPU, so the batches do not depend on the data set's device.
     """
@@ -232,12 +211,20 @@ class Sampler:
         self.draws.set_state(state["batches"])
         self.view.load_state_dict(state["view"])
 
-    def _draw(self, count: int) -> torch.Tensor:
+    def _draw(self, count: int) -> Tensor:
         return self.draws.integers(count, self._batch_size)
+
+    @abstractmethod
+    def sample(self) -> Any:
+        """The next batch, on the data set's device."""
+
+    def __iter__(self) -> Iterator[Any]:
+        while True:
+            yield self.sample()
 
 
 class WindowSampler(Sampler):
-    """Samples windows uniformly over the data set, with replacement."""
+    """Samples windows of `length` rows."""
 
     def __init__(self, source: Dataset | View, batch_size: int, length: int, draws: RandomStream) -> None:
         super().__init__(source, batch_size, draws)
@@ -247,13 +234,9 @@ class WindowSampler(Sampler):
         """The next batch, on the data set's device."""
         return self.view.windows(self._draw(self._count), self._length)
 
-    def __iter__(self) -> Iterator[Windows]:
-        while True:
-            yield self.sample()
-
 
 class TransitionSampler(Sampler):
-    """Samples n-step transitions uniformly over the data set, with replacement."""
+    """Samples n-step transitions."""
 
     def __init__(
         self,
@@ -271,7 +254,3 @@ class TransitionSampler(Sampler):
     def sample(self) -> Transitions:
         """The next batch, on the data set's device."""
         return self.view.transitions(self._draw(self.view.dataset.num_transitions), self._n_step, self._gamma)
-
-    def __iter__(self) -> Iterator[Transitions]:
-        while True:
-            yield self.sample()

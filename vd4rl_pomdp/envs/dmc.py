@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -15,6 +14,8 @@ from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs import rendering
 from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep, between, check_bounds
 from vd4rl_pomdp.envs.rendering import mujoco, suite
+
+_JOINT = mujoco.mjtJoint
 
 
 class DMCEnv(PixelEnv):
@@ -49,14 +50,18 @@ class DMCEnv(PixelEnv):
         return self._layout
 
     def _found_layout(self, camera: int) -> Layout:
-        """Derive the layout from the model. Positions that a tracking camera cannot show are marked in it."""
         model = self.physics.model
         self.simulator.reset()  # some tasks have no observation before the first reset
-        state = flat_state(self.simulator)
+        widths = self.simulator.action_spec().shape[0], len(flat_state(self.simulator)), model.nq
         travel, beside = _ground_travel(model, camera)
-        turning, quaternions = _free_joints(model)
-        widths = self.simulator.action_spec().shape[0], len(state), model.nq
-        return Layout(*widths, travel, turning, quaternions, beside, _unseen(model))
+        joints = list(zip(model.jnt_type, model.jnt_qposadr, model.jnt_limited, model.jnt_bodyid, strict=True))
+        turning = [int(start) for kind, start, limited, _ in joints if kind == _JOINT.mjJNT_HINGE and not limited]
+        offset = {_JOINT.mjJNT_FREE: 3, _JOINT.mjJNT_BALL: 0}  # a free joint's qpos starts with x, y, z
+        quaternions = [int(start) + offset[kind] for kind, start, *_ in joints if kind in offset]
+        # no camera can show bodies without any geom in their tree
+        visible = set(model.body_rootid[model.geom_bodyid].tolist())
+        unseen = [int(start) for _, start, _, body in joints if int(model.body_rootid[body]) not in visible]
+        return Layout(*widths, travel, tuple(turning), tuple(quaternions), beside, tuple(unseen))
 
     @property
     def rate(self) -> float:
@@ -126,16 +131,7 @@ def repeat_action(env: Any, action: np.ndarray, repeat: int) -> tuple[float, boo
 
 
 def replay_rewards(task: str, physics: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Replay an action sequence from a simulator state and return the rewards.
-
-    Args:
-        task: name of a dm_control task.
-        physics: (P,) float64 state of the first row.
-        actions: (T, A) float32, a_0 first.
-
-    Returns:
-        (T,) float64: r_0 .. r_{T-1}.
-    """
+    """Rewards (T,) float64 of actions (T, A) in a dm_control task, from the simulator state (P,) of the first row."""
     played = TASKS.named(task)
     assert isinstance(played, DMCTask), "other tasks store no states"
     env = _load(played, np.random.RandomState(0))
@@ -147,17 +143,14 @@ def replay_rewards(task: str, physics: np.ndarray, actions: np.ndarray) -> np.nd
 def replays(task: DMCTask) -> bool:
     """Whether the simulator state determines an episode. False for tasks that randomise the model, such as a target."""
     random = np.random.RandomState(0)
-    env = _load(task, random)
-    return _model_of_an_episode(env, random, 1) == _model_of_an_episode(env, random, 2)
-
-
-def _model_of_an_episode(env: Any, random: np.random.RandomState, seed: int) -> bytes:
-    random.seed(seed)
-    env.reset()
-    model = env.physics.model.ptr
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
+    env, models = _load(task, random), []
+    for seed in (1, 2):
+        random.seed(seed)
+        env.reset()
+        model = env.physics.model.ptr
+        models.append(np.empty(mujoco.mj_sizeModel(model), np.uint8))
+        mujoco.mj_saveModel(model, None, models[-1])
+    return np.array_equal(models[0], models[1])
 
 
 def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -169,40 +162,21 @@ def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int,
     """
     if model.cam_mode[camera] not in (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM):
         return (), ()
-    on_ground = [list(_ground_positions(model, joint)) for joint in range(model.njnt)]
+    on_ground: list[list[int]] = [[] for _ in range(model.njnt)]
+    for joint, kind in enumerate(model.jnt_type):
+        start, child_of_world = int(model.jnt_qposadr[joint]), model.body_parentid[model.jnt_bodyid[joint]] == 0
+        if child_of_world and kind == _JOINT.mjJNT_FREE:
+            on_ground[joint] = [start, start + 1]
+        elif child_of_world and kind == _JOINT.mjJNT_SLIDE and abs(model.jnt_axis[joint][2]) < 0.5:
+            on_ground[joint] = [start]
     moving = {int(model.jnt_bodyid[joint]): kind for joint, kind in enumerate(model.jnt_type) if on_ground[joint]}
     followed = int(model.body_rootid[model.cam_bodyid[camera]])
     subject = followed or next(iter(moving), 0)  # a camera attached to the world follows the centre of all bodies
     travel = [place for joint, places in enumerate(on_ground) if model.jnt_bodyid[joint] == subject for place in places]
-    if moving.get(subject) != mujoco.mjtJoint.mjJNT_FREE:
+    if moving.get(subject) != _JOINT.mjJNT_FREE:
         return tuple(travel), ()
     others = [places[0] for joint, places in enumerate(on_ground) if len(places) == 2 and places[0] != travel[0]]
     return tuple(travel), tuple(others)
-
-
-def _ground_positions(model: Any, joint: int) -> Iterator[int]:
-    """qpos entries of a joint that are positions along the ground, if its body is a child of the world."""
-    kind, start, body = model.jnt_type[joint], int(model.jnt_qposadr[joint]), model.jnt_bodyid[joint]
-    if model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_FREE:
-        yield from (start, start + 1)
-    elif model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(model.jnt_axis[joint][2]) < 0.5:
-        yield start
-
-
-def _unseen(model: Any) -> tuple[int, ...]:
-    """qpos entries of bodies without any geom in their tree, which no camera can show."""
-    shown = set(model.body_rootid[model.geom_bodyid].tolist())
-    joints = zip(model.body_rootid[model.jnt_bodyid], model.jnt_qposadr, strict=True)
-    return tuple(int(start) for root, start in joints if int(root) not in shown)
-
-
-def _free_joints(model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """qpos entries that are angles of unlimited hinges, and the first entry of every quaternion."""
-    joints = list(zip(model.jnt_type, model.jnt_qposadr, model.jnt_limited, strict=True))
-    turning = [int(start) for kind, start, limited in joints if kind == mujoco.mjtJoint.mjJNT_HINGE and not limited]
-    offset = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}  # a free joint's qpos starts with x, y, z
-    quaternions = [int(start) + offset[kind] for kind, start, _ in joints if kind in offset]
-    return tuple(turning), tuple(quaternions)
 
 
 def _load(task: DMCTask, random: np.random.RandomState) -> Any:
@@ -210,7 +184,10 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
     rendering.check_mujoco()
     arguments = {"random": random, "time_limit": float("inf")}
     if "." in task.domain:
-        make = partial(_of_a_module(task), **arguments)
+        try:
+            make = partial(importlib.import_module(task.domain).SUITE[task.task], **arguments)
+        except (ImportError, AttributeError, KeyError) as error:
+            raise UserError(f"{task.domain} offers no task {task.task!r} in a SUITE ({first_line(error)})") from error
     elif (task.domain, task.task) in suite.ALL_TASKS:
         make = partial(suite.load, task.domain, task.task, task_kwargs=arguments)
     else:
@@ -228,11 +205,3 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
         ) from error
     check_bounds(f"dm_control's {task.domain} {task.task}", env.action_spec().minimum, env.action_spec().maximum)
     return env
-
-
-def _of_a_module(task: DMCTask) -> Any:
-    """Environment factory from a module with a dm_control-like SUITE."""
-    try:
-        return importlib.import_module(task.domain).SUITE[task.task]
-    except (ImportError, AttributeError, KeyError) as error:
-        raise UserError(f"{task.domain} offers no task {task.task!r} in a SUITE ({first_line(error)})") from error

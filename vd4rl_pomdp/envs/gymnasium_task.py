@@ -56,12 +56,11 @@ class GymnasiumEnv(PixelEnv):
         self._name = task.name
         self._renders = task.pixels == "render"
         arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
-        with self._telling("cannot be made", (*_REFUSALS, TypeError, AttributeError, RuntimeError)):
+        with self._own_errors("cannot be made", (*_REFUSALS, TypeError, AttributeError, RuntimeError)):
             if isinstance(task.environment, str):
                 self.env = gymnasium.make(task.environment, disable_env_checker=True, **arguments)
             else:
                 self.env = task.environment(**arguments)
-        """The Gymnasium environment."""
         space = self.env.action_space
         floating = np.issubdtype(space.dtype, np.floating)
         if not isinstance(space, gymnasium.spaces.Box) or not floating or not space.low.size:
@@ -82,29 +81,28 @@ class GymnasiumEnv(PixelEnv):
     def rate(self) -> float:
         """Decisions per second of simulated time.
 
-        Taken from the environment's `dt` or dm_control's `control_timestep()`, if it has one, else from `render_fps`
-        in its metadata, else 30. `render_fps` is only a fallback: it is a playback rate, and shimmy's is not the true
-        rate.
+        From the environment's `dt` or dm_control's `control_timestep()`, else from its metadata's `render_fps`, which
+        is a playback rate (shimmy's is not the true one), else 30.
         """
         for name in ("dt", "control_timestep"):
             step = getattr(self.env.unwrapped, name, None)
             step = step() if callable(step) else step
             if isinstance(step, _NUMBERS) and step > 0:
                 return 1 / float(step) / self.task.action_repeat
-        told = self.env.metadata.get("render_fps", 30)
-        if not (isinstance(told, _NUMBERS) and 1 <= told <= MOST_STEPS_A_SECOND):
+        rate = self.env.metadata.get("render_fps", 30)
+        if not (isinstance(rate, _NUMBERS) and 1 <= rate <= MOST_STEPS_A_SECOND):
             raise UserError(
-                f"environment {self._name} has the render_fps {told!r} in its metadata: correct it to the steps "
+                f"environment {self._name} has the render_fps {rate!r} in its metadata: correct it to the steps "
                 f"per second of simulated time, 1 to {MOST_STEPS_A_SECOND}, or give the environment a `dt` in seconds"
             )
-        return float(told) / self.task.action_repeat
+        return float(rate) / self.task.action_repeat
 
     def close(self) -> None:
         """Close the Gymnasium environment."""
         self.env.close()
 
     @contextmanager
-    def _telling(self, what: str, refusals: tuple[type[Exception], ...] = _REFUSALS) -> Iterator[None]:
+    def _own_errors(self, what: str, refusals: tuple[type[Exception], ...] = _REFUSALS) -> Iterator[None]:
         """Turn an environment's own errors, such as a missing package or OpenGL, into a UserError."""
         try:
             with gl_errors():
@@ -118,8 +116,8 @@ class GymnasiumEnv(PixelEnv):
 
     def _begin(self, seed: int) -> None:
         try:
-            with self._telling("cannot be reset"):
-                given = self.env.reset(seed=seed)
+            with self._own_errors("cannot be reset"):
+                returned = self.env.reset(seed=seed)
         except TypeError as error:
             if "'seed'" not in str(error):  # a TypeError from inside the environment
                 raise
@@ -127,45 +125,40 @@ class GymnasiumEnv(PixelEnv):
                 f"environment {self._name} cannot be reset with a seed ({in_one_line(error)}): give it Gymnasium's "
                 "`reset(self, *, seed=None, options=None)`, or wrap it"
             ) from error
-        self._observation, _ = self._of_interface("reset", given, 2)
+        self._observation, _ = self._unpacked("reset", returned, 2)
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
         rescaled, total = self._rescaled(action), 0.0
         for _ in range(self.task.action_repeat):
-            with self._telling("cannot make a step"):
-                given = self.env.step(rescaled.copy())
-            self._observation, reward, terminated, truncated, _ = self._of_interface("step", given, 5)
-            total += self._paid(reward)
+            with self._own_errors("cannot make a step"):
+                returned = self.env.step(rescaled.copy())
+            self._observation, reward, terminated, truncated, _ = self._unpacked("step", returned, 5)
+            try:
+                number = float(np.asarray(reward).item())
+            except (TypeError, ValueError):
+                number = math.nan
+            if not math.isfinite(number):
+                raise UserError(
+                    f"environment {self._name} returns the reward {reward}, expected a number: correct or wrap it"
+                )
+            total += number
             if terminated or truncated:
                 return total, True, 0.0 if terminated else 1.0
         return total, False, 1.0
 
-    def _of_interface(self, method: str, given: Any, length: int) -> Any:
-        if not isinstance(given, tuple) or len(given) != length:
-            found = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
-            raise UserError(
-                f"environment {self._name} returns {found} from {method}, expected {length} as in Gymnasium: wrap it"
-            )
-        return given
-
-    def _paid(self, reward: Any) -> float:
-        try:
-            paid = float(np.asarray(reward).item())
-        except (TypeError, ValueError):
-            paid = math.nan
-        if not math.isfinite(paid):
-            raise UserError(
-                f"environment {self._name} returns the reward {reward}, expected a number: correct or wrap it"
-            )
-        return paid
-
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
-        """Rescale an (A,) action from [-1, 1] to the environment's bounds, shape and dtype."""
         low, high = self._space.low, self._space.high
         return between(np.reshape(action, low.shape), low, high)
 
+    def _unpacked(self, method: str, returned: Any, length: int) -> Any:
+        if not isinstance(returned, tuple) or len(returned) != length:
+            found = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
+            raise UserError(
+                f"environment {self._name} returns {found} from {method}, expected {length} as in Gymnasium: wrap it"
+            )
+        return returned
+
     def _frame(self, size: int) -> np.ndarray:
-        """Current image as (3, size, size) uint8, resized by area averaging."""
         picture = self._picture()
         picture = picture if picture.shape[:2] == (size, size) else area_means(picture, size)
         return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may reuse its buffer
@@ -176,14 +169,14 @@ class GymnasiumEnv(PixelEnv):
 
     def _picture(self) -> np.ndarray:
         """Current image as (H, W, 3) uint8; a grey one is repeated to three channels."""
-        shown = self._rendered() if self._renders else self._observation
-        picture = shown if isinstance(shown, np.ndarray) else np.zeros(0)
+        given = self._rendered() if self._renders else self._observation
+        picture = given if isinstance(given, np.ndarray) else np.zeros(0)
         if picture.ndim == 3 and picture.shape[0] in (1, 3) and picture.shape[-1] not in (1, 3):
             picture = picture.transpose(1, 2, 0)
         if picture.ndim == 2:
             picture = picture[..., None]
         if picture.ndim != 3 or picture.shape[-1] not in (1, 3) or picture.dtype != np.uint8 or not picture.size:
-            got = f"{picture.dtype} of shape {picture.shape}" if isinstance(shown, np.ndarray) else type(shown).__name__
+            got = f"{picture.dtype} of shape {picture.shape}" if isinstance(given, np.ndarray) else type(given).__name__
             raise UserError(
                 f"environment {self._name} returns {got} from its {'render()' if self._renders else 'observation'}, "
                 "expected uint8 images (H, W, 3): choose pixels='render' or 'observation', or wrap it"
@@ -196,7 +189,7 @@ class GymnasiumEnv(PixelEnv):
         viewer = getattr(renderer, "viewer", None)  # created at the first render
         if renderer is not None:
             refuse_after_fork()
-        with undisturbed(), self._telling("cannot render"):
+        with undisturbed(), self._own_errors("cannot render"):
             if viewer is not None:
                 viewer.make_context_current()
             picture = self.env.render()

@@ -11,14 +11,8 @@ from vd4rl_pomdp.envs.pixels import PixelEnv, Render, check_render
 def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None) -> PixelEnv:
     """Build the environment of a task.
 
-    Args:
-        task: the task.
-        render: rendering mode of dm_control.
-        size: height and width S of the frames; None: no rendering.
-        length: time limit in decisions; None: the task's.
-
-    Raises:
-        UserError: the environment cannot be built, or is of an unsupported kind.
+    `size` is the height and width S of the frames (None: no rendering), `length` the time limit in decisions (None: the
+    task's). UserError for an environment that cannot be built.
     """
     check_render(render)
     if isinstance(task, GymnasiumTask):

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ import numpy as np
 from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_renderers import FACE, ExactRenderer, MazeRenderer, make_renderer, sky_texture
-from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, MazeSpec, Style, get_maze
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, MazeSpec, get_maze
 from vd4rl_pomdp.envs.opengl import gl_errors
 from vd4rl_pomdp.envs.pixels import Render, check_render, checked_action
 from vd4rl_pomdp.envs.rendering import mujoco
@@ -154,28 +152,23 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _simulate(self, action: np.ndarray) -> None:
         """Run PointMaze's simulator steps; in first person the action sets velocities first, and the motors get 0."""
+        style, point = self.maze_spec.style, self._point
         if self.maze_spec.first_person:
-            self._steer(action)
+            if style.push is None or action.any():  # with a push, the original generator changes no velocities for 0
+                push = ACCELERATION * TIMESTEP * self._repeat if style.push is None else style.push
+                qpos, qvel = point.data.qpos.copy(), point.data.qvel.copy()
+                qvel[:2] += action[0] * push * np.array([np.cos(qpos[HEADING]), np.sin(qpos[HEADING])])
+                qvel[HEADING] = action[1] * style.turning_rate
+                point.set_state(qpos, qvel)
             action = np.zeros(2)
-        if self.maze_spec.style.limited_every_step:
+        if style.limited_every_step:
             for _ in range(self._repeat):
-                self._point.step(action)
+                point.step(action)
             return
-        qvel = self._point.data.qvel.copy()
+        qvel = point.data.qvel.copy()
         qvel[:2] = np.clip(qvel[:2], -FASTEST, FASTEST)
-        self._point.set_state(self._point.data.qpos.copy(), qvel)
-        self._point.do_simulation(action, self._repeat)
-
-    def _steer(self, action: np.ndarray) -> None:
-        """Set the turning rate and accelerate the mass along its heading."""
-        style = self.maze_spec.style
-        if style.push is not None and not action.any():
-            return  # the original generator does not change velocities then
-        push = ACCELERATION * TIMESTEP * self._repeat if style.push is None else style.push
-        qpos, qvel = self._point.data.qpos.copy(), self._point.data.qvel.copy()
-        qvel[:2] += action[0] * push * np.array([np.cos(qpos[HEADING]), np.sin(qpos[HEADING])])
-        qvel[HEADING] = action[1] * style.turning_rate
-        self._point.set_state(qpos, qvel)
+        point.set_state(point.data.qpos.copy(), qvel)
+        point.do_simulation(action, self._repeat)
 
     def _free_place(self, room: float = 0.0) -> np.ndarray:
         """Position sampled uniformly from where the mass, enlarged by `room`, fits."""
@@ -209,14 +202,12 @@ def replay_states(maze: str, state: np.ndarray, actions: np.ndarray, action_repe
 def build_simulator(spec: MazeSpec) -> tuple[PointEnv, Maze]:
     """PointMaze's simulator with the maze's modified model, and gymnasium-robotics' description of the maze."""
     maze, file = Maze.make_maze(str(POINT_XML), U_MAZE, 1.0, _WALL_HEIGHT)
+    path = Path(file)
     try:
-        xml = _change(spec, mujoco.MjSpec.from_file(file)).to_xml()
+        path.write_text(_change(spec, mujoco.MjSpec.from_file(file)).to_xml(), encoding="utf-8")
+        point = PointEnv(xml_file=file)
     finally:
-        os.unlink(file)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "maze.xml"
-        path.write_text(xml, encoding="utf-8")
-        point = PointEnv(xml_file=str(path))
+        path.unlink()
     if spec.first_person:
         point.model.dof_damping[HEADING] = spec.style.heading_damping
         start, texture = int(point.model.tex_adr[point.model.tex("skybox").id]), sky_texture(spec.style.sky)
@@ -243,20 +234,16 @@ def _change(spec: MazeSpec, model: mujoco.MjSpec) -> mujoco.MjSpec:
             conaffinity=0,
             group=2,
         )
-    if spec.first_person:
-        _open_eyes(model, spec.style)
-    else:
+    if not spec.first_person:
         model.worldbody.add_camera(name="view", pos=[0, 0, spec.style.camera_height], fovy=spec.style.camera_fovy)
-    return model
-
-
-def _open_eyes(model: mujoco.MjSpec, style: Style) -> None:
-    """Set up first person: a heading joint, a camera in the mass, no visible ball, and a skybox to be filled later."""
+        return model
+    # a heading joint, a camera in the mass, no visible ball, and a skybox to be filled later
     model.visual.map.znear = 0.001  # walls come as near as 0.1
     body = model.body("particle")
     body.add_joint(name="heading", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
-    body.add_camera(name="view", pos=[0, 0, style.eye_height], quat=_AHEAD, fovy=style.eye_fovy)
+    body.add_camera(name="view", pos=[0, 0, spec.style.eye_height], quat=_AHEAD, fovy=spec.style.eye_fovy)
     model.delete(model.site("particle_site"))
     sky = model.texture("skybox")
     sky.mark = mujoco.mjtMark.mjMARK_NONE
     sky.width, sky.height = FACE, 6 * FACE
+    return model

@@ -37,33 +37,24 @@ class ExactRenderer:
         model.vis.quality.offsamples = 0
         side = model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * _FINE
         with gl_errors(), undisturbed():
-            self._renderer = mujoco.Renderer(model, side, side)
-        close_at_exit(self._renderer)
+            self.renderer = mujoco.Renderer(model, side, side)
+        close_at_exit(self.renderer)
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
         """Image of the current state; after a step, MuJoCo's body positions are still those before it."""
         mujoco.mj_kinematics(self._model, data)  # not mj_forward, which would change the solver's warm start
         mujoco.mj_camlight(self._model, data)
-        self._renderer.update_scene(data, camera="view")
-        return average(self._rendered(), _FINE)
+        return average(self.fine_picture(data), _FINE)
 
-    def fine_picture(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Colours (H, H, 3) uint8 and depths (H, H) float32 before averaging, H = 100 * 4."""
-        self._renderer.update_scene(data, camera="view")
-        colors = self._rendered().copy()
-        self._renderer.enable_depth_rendering()
-        depths = self._rendered().copy()
-        self._renderer.disable_depth_rendering()
-        return colors, depths
-
-    def _rendered(self) -> np.ndarray:
-        """The renderer's buffer."""
+    def fine_picture(self, data: mujoco.MjData) -> np.ndarray:
+        """Colours (H, H, 3) uint8, H = 100 * 4, or depths (H, H) float32 if `renderer` renders these."""
+        self.renderer.update_scene(data, camera="view")
         with undisturbed():
-            return self._renderer.render()
+            return self.renderer.render().copy()
 
     def close(self) -> None:
         """Free the GL context."""
-        self._renderer.close()
+        self.renderer.close()
 
 
 def average(fine: np.ndarray, by: int) -> np.ndarray:
@@ -80,8 +71,10 @@ class TopRenderer:
         ball, exact, data = model.site("particle_site"), ExactRenderer(model), mujoco.MjData(model)
         color, ball.rgba[3] = ball.rgba.copy(), 0
         mujoco.mj_forward(model, data)
-        self._colors, self._depths = exact.fine_picture(data)
-        """(H, H, 3) and (H, H), of the maze without the ball."""
+        self._colors = exact.fine_picture(data)
+        """(H, H, 3) uint8, of the maze without the ball."""
+        exact.renderer.enable_depth_rendering()
+        self._depths = exact.fine_picture(data)
         exact.close()
         ball.rgba[:] = color
         self._picture = average(self._colors, _FINE)
@@ -148,7 +141,13 @@ class FirstPersonRenderer:
         """(side,) and (side, 1) slopes of the rays, by column and by row."""
         self._eye, self._wall_top = style.eye_height, style.walls[1]
         self._wall_bottom = max(style.walls[0], _GROUND)
-        self._sky = _SkyTable(style, self._left, self._up[: side // 2])
+        # the sky is looked up in a panorama, for the rays of the image's upper half
+        elevation = np.arctan2(self._up[: side // 2], np.hypot(1, self._left))
+        levels = np.arange(0, elevation.max() + _BIN, _BIN)
+        self._panorama = None if style.sky == "none" else panorama(sky_texture(style.sky), levels)
+        self._level = (elevation / _BIN + 0.5).astype(np.int32)
+        """(rows, columns) index into the panorama's elevation axis."""
+        self._azimuth = np.arctan(self._left)
         self._to_floor = (self._eye - _GROUND) / steps[side // 2 :, None]
         """(side / 2, 1) distance ahead at which the lower half's rays hit the floor."""
         cells = [(row, column) for row in range(5) for column in range(5) if (row, column) not in FREE_CELLS]
@@ -166,18 +165,23 @@ class FirstPersonRenderer:
         height = self._eye + self._up * distance
         kinds = np.where(height <= self._wall_top, faces, np.uint8(self._SKY))
         lower = len(kinds) // 2
-        np.copyto(kinds[lower:], self._floor(place, rays), where=height[lower:] < self._wall_bottom)
-        picture = self._color(kinds, ahead)
-        self._sky.add_to(picture[:, : PICTURE_SIZE // 2], kinds[:lower] == self._SKY, heading)
-        return picture
-
-    def _floor(self, place: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Floor kinds, light or dark square, (rows of the lower half, columns)."""
         x, y = (
             (self._to_floor * (rays[:, i] / _SQUARE) + (place[i] / _SQUARE + self._OFFSET)).astype(np.int32)
             for i in (0, 1)
         )
-        return np.where((x ^ y) & 1, np.uint8(self._LIGHT), np.uint8(self._DARK))
+        floor = np.where((x ^ y) & 1, np.uint8(self._LIGHT), np.uint8(self._DARK))
+        np.copyto(kinds[lower:], floor, where=height[lower:] < self._wall_bottom)
+        walls = [_WALL_COLOR * (_AMBIENT + _DIFFUSE * light) for light in (0.0, *np.abs(ahead))]
+        colors = np.array([np.zeros(3), _FLOOR_LIGHT * _AMBIENT, _FLOOR_DARK * _AMBIENT, *walls])
+        palette = (np.minimum(colors, 1) * 255 + 0.5).astype(np.uint16)
+        parts = [kinds[i :: self._FINE, j :: self._FINE] for i in range(self._FINE) for j in range(self._FINE)]
+        sums = [sum(shade[part] for part in parts) for shade in palette.T]
+        picture = ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
+        sky = kinds[:lower] == self._SKY
+        if self._panorama is not None and sky.any():
+            column = ((heading + self._azimuth + np.pi) / _BIN).astype(np.int32) % BINS
+            picture[:, : PICTURE_SIZE // 2] += average(self._panorama[column, self._level] * sky[..., None], self._FINE)
+        return picture
 
     def _nearest_wall(self, place: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance ahead (columns,) of the nearest wall on each ray (columns, 2), and the axis of the face hit."""
@@ -189,20 +193,12 @@ class FirstPersonRenderer:
         wall, columns = hit.argmin(0), np.arange(len(rays))
         return hit[wall, columns], enter[wall, columns].argmax(-1)
 
-    def _color(self, kinds: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-        """Image of (side, side) kinds, averaged over the rays of each pixel."""
-        walls = [_WALL_COLOR * (_AMBIENT + _DIFFUSE * light) for light in (0.0, *np.abs(ahead))]
-        colors = np.array([np.zeros(3), _FLOOR_LIGHT * _AMBIENT, _FLOOR_DARK * _AMBIENT, *walls])
-        palette = (np.minimum(colors, 1) * 255 + 0.5).astype(np.uint16)
-        parts = [kinds[i :: self._FINE, j :: self._FINE] for i in range(self._FINE) for j in range(self._FINE)]
-        sums = [sum(shade[part] for part in parts) for shade in palette.T]
-        return ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
-
 
 FACE = 400
 """Texels per edge of the skybox cube."""
 BINS = 2048
 """Columns of a panorama: azimuths from -pi, counterclockwise."""
+_BIN = 2 * np.pi / BINS
 _TOP, _STARS, _TWINKLE = np.array([0.4, 0.6, 0.8]), 0.01, 2
 """PointMaze's sky: colour at the zenith (black at the nadir), share of white texels, star texels per texel edge."""
 _ACROSS = (np.arange(FACE) + 0.5) / FACE * 2 - 1
@@ -245,34 +241,10 @@ def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
     found = np.zeros((*x.shape, 3), np.uint8)
     x, y, z = (side / largest for side in (x, y, z))
     places = ((x == 1, y, -z), (x == -1, -y, -z), (z == 1, x, -y), (z == -1, x, y), (y == -1, x, -z), (y == 1, -x, -z))
-    for face, (there, column, row) in zip(texture.reshape(6, FACE, FACE, 3), places, strict=True):
-        at = [np.minimum(((side[there] + 1) / 2 * FACE).astype(int), FACE - 1) for side in (row, column)]
-        found[there] = face[at[0], at[1]]
+    for face, (mask, column, row) in zip(texture.reshape(6, FACE, FACE, 3), places, strict=True):
+        at = [np.minimum(((side[mask] + 1) / 2 * FACE).astype(int), FACE - 1) for side in (row, column)]
+        found[mask] = face[at[0], at[1]]
     return found
-
-
-class _SkyTable:
-    """Looks up the sky in a panorama, for the rays of the image's upper half."""
-
-    _STEP = 2 * np.pi / BINS
-
-    def __init__(self, style: Style, left: np.ndarray, up: np.ndarray) -> None:
-        """Prepare for rays (1, left, up), with slopes `left` (columns,) and `up` (rows, 1)."""
-        self._black = style.sky == "none"
-        elevation = np.arctan2(up, np.hypot(1, left))
-        levels = np.arange(0, elevation.max() + self._STEP, self._STEP)
-        self._panorama = panorama(sky_texture(style.sky), levels)
-        self._level = (elevation / self._STEP + 0.5).astype(np.int32)
-        """(rows, columns) index into the panorama's elevation axis."""
-        self._azimuth = np.arctan(left)
-
-    def add_to(self, picture: np.ndarray, seen: np.ndarray, heading: float) -> None:
-        """Add the sky to an image (3, H / 2, H), black where sky is; `seen` (rows, columns): rays that hit the sky."""
-        if self._black or not seen.any():
-            return
-        column = ((heading + self._azimuth + np.pi) / self._STEP).astype(np.int32) % BINS
-        colors = self._panorama[column, self._level] * seen[..., None]
-        picture += average(colors, seen.shape[0] * 2 // picture.shape[2])
 
 
 MazeRenderer = ExactRenderer | TopRenderer | FirstPersonRenderer

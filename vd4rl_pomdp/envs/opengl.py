@@ -43,11 +43,10 @@ def gl_errors() -> Iterator[None]:
         if not any(f"{name}.".startswith(_LIBRARIES) for name in modules):
             raise
         _drop_half_made(error)
-        read = {name: value for name, value in sorted(os.environ.items()) if name.startswith(_VARIABLES)}
-        told = ", ".join(f"{name}={shlex.quote(value)}" for name, value in read.items())
+        read = (f"{k}={shlex.quote(v)}" for k, v in sorted(os.environ.items()) if k.startswith(_VARIABLES))
         raise UserError(
-            f"cannot render with {told} ({first_line(error)}): correct or unset the variable at fault, or set "
-            "MUJOCO_GL to egl (Debian: libegl1, libgl1, libgl1-mesa-dri), osmesa (libosmesa6) or glfw (needs a "
+            f"cannot render with {', '.join(read)} ({first_line(error)}): correct or unset the variable at fault, or "
+            "set MUJOCO_GL to egl (Debian: libegl1, libgl1, libgl1-mesa-dri), osmesa (libosmesa6) or glfw (needs a "
             "screen)"
         ) from error
 
@@ -93,13 +92,8 @@ def keep_display() -> None:
 def close_at_exit(drawing: Any) -> None:
     """Close `drawing`, a renderer with a context made by mujoco, at exit, before OpenGL itself is shut down."""
     keep_display()
-    atexit.register(_close, weakref.ref(drawing))
-
-
-def _close(drawing: weakref.ref[Any]) -> None:
-    alive = drawing()
-    if alive is not None:
-        alive.close()
+    reference = weakref.ref(drawing)
+    atexit.register(lambda: (alive := reference()) and alive.close())
 
 
 @contextlib.contextmanager

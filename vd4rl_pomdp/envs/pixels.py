@@ -84,16 +84,13 @@ def checked_action(action: Any, dimensions: int) -> np.ndarray:
 
 
 class PixelEnv(ABC):
-    """One task. An episode's first state depends only on its seed."""
+    """One task. An episode's first state depends only on its seed.
+
+    `size` is the height and width S of the frames (None: no rendering), `length` the time limit in decisions (None: the
+    task's).
+    """
 
     def __init__(self, task: Task, size: int | None, length: int | None) -> None:
-        """Initialise.
-
-        Args:
-            task: the task.
-            size: height and width S of the frames; None: no rendering.
-            length: time limit in decisions; None: the task's.
-        """
         self.task, self.size = task, size
         self.drawing = size is not None
         """Whether to render the next time steps; may be switched at any time if `size` is given."""

@@ -62,7 +62,6 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """(major, minor) of a version."""
     return tuple(int(part) for part in version.split(".")[:2])
 
 
@@ -72,8 +71,7 @@ def prepare(physics: Any, render: Render, size: int) -> None:
     Call it before the first render of `physics`. The buffer, 640x480 by default, is cleared for every frame, so it is
     reduced to `size` x `size`.
     """
-    model = physics.model
-    sky = _sky()
+    model, sky = physics.model, _sky()
     number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     start = model.tex_adr[number]
     stored = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
@@ -117,13 +115,12 @@ def _center_floors(model: Any) -> None:
 
 
 class FrameCamera:
-    """Renders a simulator's frames in V-D4RL's format.
+    """Renders a simulator's frames in V-D4RL's format; the OpenGL context is created at the first frame.
 
     It keeps its camera: `physics.render` sets one up for every frame, which adds a sixth of the rendering time.
     """
 
     def __init__(self, physics: Any, size: int = FRAME_SIZE, camera: int = 0) -> None:
-        """Store the arguments; the OpenGL context is created at the first frame."""
         self._physics, self._size, self._number = physics, size, camera
         self._camera: Camera | None = None
 

@@ -9,6 +9,7 @@ that they do not depend on the processor.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from dataclasses import dataclass
 from functools import cached_property
@@ -47,15 +48,7 @@ class Actor:
     """Hash of the file that it was read from."""
 
     def act(self, state: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
-        """Action for one state.
-
-        Args:
-            state: (D,) float32, dm_control's observations, flattened in order.
-            rng: generator for sampling the action; None: the mean action.
-
-        Returns:
-            (A,) float32 in [-1, 1].
-        """
+        """Action (A,) float32 in [-1, 1] for dm_control's flattened observations (D,); without `rng` its mean."""
         state = state.astype(np.float64)
         if "observation.mean" in self.weights:
             scaled = (state - self._double["observation.mean"]) / self._double["observation.std"]
@@ -75,20 +68,14 @@ class Actor:
     def _features(self, x: np.ndarray) -> np.ndarray:
         """Output of the hidden layers, from which mean and log standard deviation are computed."""
         if "embed.weight" not in self.weights:
-            for layer in range(self._count("hidden.{}.weight")):
+            for layer in itertools.takewhile(lambda i: f"hidden.{i}.weight" in self.weights, itertools.count()):
                 x = np.maximum(self._linear(f"hidden.{layer}", x), 0.0)
             return x
         x = self._linear("embed", x)
-        for block in range(self._count("block.{}.up.weight")):
+        for block in itertools.takewhile(lambda i: f"block.{i}.up.weight" in self.weights, itertools.count()):
             up = self._linear(f"block.{block}.up", self._normed(f"block.{block}.norm", x))
             x = x + self._linear(f"block.{block}.down", np.maximum(up, 0.0))
         return self._normed("norm", x)
-
-    def _count(self, pattern: str) -> int:
-        count = 0
-        while pattern.format(count) in self.weights:
-            count += 1
-        return count
 
     def _normed(self, name: str, x: np.ndarray) -> np.ndarray:
         centred = x - x.mean()
@@ -128,13 +115,9 @@ class Ladder:
         return [Actor({name: value[i] for name, value in stacked.items()}, self.card) for i in range(count)]
 
     def actor_at(self, progress: float) -> Actor | None:
-        """The actor at a point of the training run.
+        """The rung nearest, in decisions, to a fraction `progress` of the training run, 1 being the last rung.
 
-        Args:
-            progress: fraction of the run, in [0, 1]; 1 is the last rung.
-
-        Returns:
-            The nearest rung in decisions; None if step 0 is nearer, which stands for uniformly random actions.
+        None if step 0 is nearer, which stands for uniformly random actions.
         """
         steps = np.array([0, *self.card["decisions"]])
         nearest = int(np.abs(steps - progress * steps[-1]).argmin())
@@ -153,10 +136,7 @@ def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> N
 
 
 def read_actor(path: Path, task: str | None = None) -> Actor:
-    """Read an actor file; UserError if it is missing, damaged, or made for another task than `task`.
-
-    Its weights must be finite and produce an action of the right size for the task's states.
-    """
+    """Read an actor file; UserError if it is missing, damaged, or made for another task than `task`."""
     actor = Actor(*_read(path, task))
     _check_weights(path, actor, task)
     return actor
@@ -194,11 +174,11 @@ def _check_weights(path: Path, actor: Actor, task: str | None) -> None:
     widths = layout_of(TASKS[name])
     try:
         finite = all(np.isfinite(value).all() for value in actor.weights.values())
-        action = actor.act(np.zeros(widths.state_dim, np.float32), np.random.default_rng(0)) if finite else None
+        shape = actor.act(np.zeros(widths.state_dim, np.float32), np.random.default_rng(0)).shape if finite else None
+        if shape != (widths.action_dim,):
+            raise ValueError(f"an action of shape {shape}" if finite else "they are not finite")
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: its weights do not fit an actor of {name} ({error}); {_REMEDY}") from error
-    if action is None or action.shape != (widths.action_dim,):
-        raise UserError(f"{path}: its weights do not fit an actor of {name}; {_REMEDY}")
 
 
 def load_actor(task: str, quality: str) -> Actor:

@@ -27,13 +27,10 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 
 MOST_BYTES = 4_900_000
 """Maximum size of the page. As many rows per episode are shown as fit."""
-COLUMNS = 32
-"""Frames per row of an image sheet."""
+COLUMNS = 32  # frames per row of an image sheet
 _QUALITY = 50
-_POINTS = 600
-"""Maximum points of a curve."""
-_LARGEST = 128
-"""Maximum frame size in pixels; larger frames are subsampled by an integer step."""
+_POINTS = 600  # maximum points of a curve
+_LARGEST = 128  # maximum frame size in pixels; larger frames are subsampled by an integer step
 _MARK = b"<title>vd4rl-pomdp data view"
 
 
@@ -60,7 +57,6 @@ class ViewConfig(StageConfig):
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of the corruption."""
         return {"corruption": CorruptionConfig.fill(values)}
 
     def check(self) -> None:

@@ -21,10 +21,8 @@ from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import certificates_of
 
-FILE = "comparison"
-"""Base name of its files, by which a comparison's folder is recognised."""
-Conditions = dict[tuple, list[Run]]
-"""Finished runs by the values of CONDITION."""
+FILE = "comparison"  # base name of its files, by which a comparison's folder is recognised
+Conditions = dict[tuple, list[Run]]  # finished runs by the values of CONDITION
 
 
 class SideBySide(NamedTuple):
@@ -41,9 +39,6 @@ def compare_results(one: Path, other: Path) -> SideBySide:
 
     Conditions are those of a report of each set. They are matched by equal settings, whatever their names; then by
     name; then, if a method has a single variant in each set, by method.
-
-    Raises:
-        UserError: a path holds no evaluated run, or a file is damaged.
     """
     (mine, first), (theirs, second) = _loaded(one), _loaded(other)
     runs = [run for side in (first, second) for seeds in side.values() for run in seeds]

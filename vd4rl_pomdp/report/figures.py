@@ -39,15 +39,11 @@ colour."""
 DPI = 150
 FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": DPI}, "pdf": {"metadata": {"CreationDate": None}}}
 """File formats of a figure, in addition to the SVG in the page."""
-WIDTH, HEIGHT = 10.0, 2.1
-"""Width of a figure and default height of a panel, in inches."""
+WIDTH, HEIGHT = 10.0, 2.1  # width of a figure and default height of a panel, in inches
 Draw = Callable[[Axes, pd.DataFrame], None]
-QUALITIES = ("expert", "medium_expert", "medium")
-"""Qualities in the paper's figures, which come first."""
-NAME_WIDTH = 28
-"""Characters after which a method's name is wrapped."""
-MANY = 300
-"""Number of dots above which a figure's dots are rasterised."""
+QUALITIES = ("expert", "medium_expert", "medium")  # qualities in the paper's figures, which come first
+NAME_WIDTH = 28  # characters after which a method's name is wrapped
+MANY = 300  # number of dots above which a figure's dots are rasterised
 
 
 class Plot(NamedTuple):

@@ -15,12 +15,9 @@ from vd4rl_pomdp.report.load import CONDITION, Run, title
 from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.files import Row
 
-FILM = {"clean": 4, "corrupted": 4, "return": 1}
-"""Arrays of a film and their number of dimensions."""
-STRIP_FRAMES = 8
-"""Maximum frames in a film strip."""
-MOST_BYTES = 5 * 2**20
-"""Maximum size of all films in a page, in base64; further films are left out."""
+FILM = {"clean": 4, "corrupted": 4, "return": 1}  # arrays of a film and their number of dimensions
+STRIP_FRAMES = 8  # maximum frames in a film strip
+MOST_BYTES = 5 * 2**20  # maximum size of all films in a page, in base64; further films are left out
 Film = dict[str, np.ndarray]
 
 

@@ -31,8 +31,7 @@ from vd4rl_pomdp.report.load import REFERENCES, SETTING, STATE, Run, label
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words
 
-STATE_SHARE = 0.9
-"""Minimum return of `state`, as a fraction of the data's mean return."""
+STATE_SHARE = 0.9  # minimum return of `state`, as a fraction of the data's mean return
 PUBLISHED_SHARE, ACRO_SHARE = 0.8, 0.7
 """Minimum return of `acro` under `none`: PUBLISHED_SHARE of the highest published return of BASELINES or of the
 data's mean return, whichever is smaller; ACRO_SHARE of the latter if no score is published for the quality."""
@@ -43,11 +42,9 @@ NOT_RECORDED = "convergence is not recorded"
 GATED = (*SETTING, "algorithm")
 _place = itemgetter(*GATED)
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
-NOT_REFUTED = "not refuted"
-"""Verdict of an undecided "not below" claim."""
+NOT_REFUTED = "not refuted"  # verdict of an undecided "not below" claim
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
-DISTANCE = "distance"
-"""Kind of a row that is a measurement, not a claim."""
+DISTANCE = "distance"  # kind of a row that is a measurement, not a claim
 LEADER, OTHER = "mik+a", "acro"
 OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}
 """What the leader is compared with, by the difference's name: the other method's `--history`."""
@@ -79,8 +76,7 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
     here, clean = (seen_under(under, runs) for under in (key[2], "none"))
     state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
     learned, floor = [run for run in here if run.method not in REFERENCES], as_it_is("random", here)
-    compared = sides(learned, floor)
-    above, (low, high) = difference(compared)
+    above, (low, high) = difference(compared := sides(learned, floor))
     data = {value for run in here if (value := run.reference.data_return) is not None}
     everyone = {"state": state, "acro under none": acro, "best": compared.left, "random": compared.right}
     bar, source = pixel_bar(key[0], key[1], [run.reference.data_return for run in acro or here])
@@ -99,8 +95,8 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
         if not everyone[words]:
             unknown.append(f"{words} was not measured")
         elif share is None or least is None:  # without a bar there is no share either
-            told = all(run.reference.data_return is not None for run in everyone[words])
-            unknown.append(f"the data's return is {'not above 0' if told else 'not known'}")
+            recorded = all(run.reference.data_return is not None for run in everyone[words])
+            unknown.append(f"the data's return is {'not above 0' if recorded else 'not known'}")
         elif share < least:
             found, asked = told_apart(share, least, 2)
             missed.append(f"{words} returns {found} of the data's return, less than {asked}")
@@ -165,8 +161,8 @@ def on_set(place: tuple[str, ...], runs: Iterable[Run]) -> list[Run]:
 
 def converged(runs: Iterable[Run]) -> bool | None:
     """Whether the critics of all runs converged: False if one did not, else None if one is not recorded."""
-    told = {run.converged for run in runs}
-    return False if False in told else None if None in told else True
+    known = {run.converged for run in runs}
+    return False if False in known else None if None in known else True
 
 
 def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
@@ -267,12 +263,9 @@ def _share(runs: list[Run]) -> float | None:
 class Contender(NamedTuple):
     """The runs on one side of a claim."""
 
-    method: str = ""
-    """A method; empty: every method except the other side's."""
-    history: str = "method"
-    """Its `--history`."""
-    clean: bool = False
-    """Whether to take runs without corruption, whatever the setting hides."""
+    method: str = ""  # a method; empty: every method except the other side's
+    history: str = "method"  # its `--history`
+    clean: bool = False  # whether to take runs without corruption, whatever the setting hides
 
 
 class ReturnClaim(NamedTuple):
@@ -281,12 +274,9 @@ class ReturnClaim(NamedTuple):
     text: str
     left: Contender
     right: Contender
-    hidden: bool = True
-    """True: for settings with a corruption; False: for settings without."""
-    kind: str = "above"
-    """above; not below (refuted if the left side is below); or distance, which is no claim."""
-    family: str = EXPLORATORY
-    """Claims that it is tested together with; exploratory: none."""
+    hidden: bool = True  # True: for settings with a corruption; False: for settings without
+    kind: str = "above"  # above; not below (refuted if the left side is below); or distance, which is no claim
+    family: str = EXPLORATORY  # claims that it is tested together with; exploratory: none
 
 
 _MIK_A, _MIK, _ACRO = Contender("mik+a"), Contender("mik"), Contender("acro")
@@ -364,8 +354,8 @@ def _decisive(left: list[Run], others: list[Run]) -> Sides:
     alike = [pair for pair in pairs if not pair.unlike]
     ends = [difference(pair)[1] for pair in alike]
     refuted = [pair for pair, (_, high) in zip(alike, ends, strict=True) if high is not None and high < 0]
-    shown = [low is not None and low > 0 for low, _ in ends]
-    doubted = [pair for pair, above in zip(alike, shown, strict=True) if not above or not converged(pair.right)]
+    above = [low is not None and low > 0 for low, _ in ends]
+    doubted = [pair for pair, holds in zip(alike, above, strict=True) if not holds or not converged(pair.right)]
     # The best other method alone is not enough: a weaker one with a single seed may leave the claim open.
     decisive = refuted or doubted or alike or pairs
     return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
@@ -419,10 +409,10 @@ def leads(runs: list[Run]) -> list[Row]:
         for name, history in OTHERS.items():
             if len(by_budget) < 2 or not (as_it_is(LEADER, everyone) and as_it_is(OTHER, everyone, history)):
                 continue
-            for steps, stacks in sorted(by_budget, key=math.prod):
+            for (steps, stacks), mine in sorted(by_budget.items(), key=lambda item: math.prod(item[0])):
                 row = dict(zip(GATED, place, strict=True)) | {"method": name, "variant": "", "updates": updates}
                 row |= {"units": units, "steps": steps, "stacks": stacks}
-                rows.append(row | _lead([run for run, *_ in by_budget[steps, stacks]], history))
+                rows.append(row | _lead([run for run, *_ in mine], history))
     if len({(row["updates"], row["units"]) for row in rows}) > 1:
         for row in rows:
             row["variant"] = f"{row['updates']:,} updates of {row['units']:,} units"

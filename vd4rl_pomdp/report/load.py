@@ -28,14 +28,12 @@ from vd4rl_pomdp.runs.episodes import COLUMNS
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import DAMAGED, Result, find_results
 
-SETTING = ("task", "quality", "corruption")
-"""Columns of the setting in which methods are compared."""
+SETTING = ("task", "quality", "corruption")  # columns of the setting in which methods are compared
 CONDITION = (*SETTING, "algorithm", "method", "variant")
 """Columns shared by all seeds of an experiment, which identify it."""
 IDENTITY = (*CONDITION, "seed")
 """Columns that identify a run within a report: the labels in its files, and its variant."""
-PROBES = ("probe_pose", "probe_velocity")
-"""Errors of an encoder's linear probes."""
+PROBES = ("probe_pose", "probe_velocity")  # errors of an encoder's linear probes
 CRITIC = {"critic_value": "value", "critic_moved": "moved", "data_value": "data"}
 """Convergence of a run's critic (see `critic_of`): column -> key in critic.json."""
 COSTS = ("pretrain_seconds", "finetune_seconds")
@@ -44,21 +42,17 @@ ACTION_ERRORS = ("path_error", "action_error")
 CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
 """Columns about the last evaluation, repeated with the prefix `clean_` for no corruption -> key in `summarise`."""
 MISSING = "missing"
-STATE = "state"
-"""The privileged method, which sees the simulator state whatever the setting hides."""
-END_TO_END = ("bc", "drq_bc")
-"""Baselines that are trained end to end by their own algorithm."""
+STATE = "state"  # the privileged method, which sees the simulator state whatever the setting hides
+END_TO_END = ("bc", "drq_bc")  # baselines that are trained end to end by their own algorithm
 TOLD_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
 """Methods whose encoders are trained on simulator states, including those of the probes' held-out episodes."""
 REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, STATE)
 """Reference methods (lower and upper bounds), last in a table."""
 
-Settings = dict[str, str]
-"""Values as text, by displayed name."""
+Settings = dict[str, str]  # values as text, by displayed name
 _UNSET = "unset"
 PRESETS = ("preset", "pretraining preset")
-DATA = ("data", "pretraining data")
-"""Names of the datasets' fingerprints."""
+DATA = ("data", "pretraining data")  # names of the datasets' fingerprints
 OF_CORRUPTION = "corruption "
 """Prefix for the settings of a corruption, since other plug-ins may have options of the same name."""
 ENCODER_SEED = "pretraining seed"
@@ -85,7 +79,6 @@ class Choice:
     """Which runs a report covers: all of them, unless a subclass narrows it."""
 
     def among(self, results: list[Result]) -> list[Result]:
-        """The chosen ones of the runs found, in order."""
         return results
 
     def asks(self, row: Row) -> bool:
@@ -94,7 +87,6 @@ class Choice:
 
     @property
     def wanted(self) -> Sequence[Row]:
-        """Labels of the policies that should exist, if known."""
         return ()
 
 
@@ -110,15 +102,12 @@ def without_options(row: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, 
 class Run:
     """A run of any stage, finished or not."""
 
-    result: Result
-    """Its files."""
+    result: Result  # its files
     labels: Row
     """Values of `options.LABELS`; the task is empty until the run has opened its data. If other runs use other options
     of the same corruption, the options are appended ("patch, patch_size 48"), as that is a different setting."""
-    settings: Settings
-    """All settings, as text, in which runs of its method may differ."""
-    reference: Reference
-    """What its policy is compared with: data and behaviour policy."""
+    settings: Settings  # all settings, as text, in which runs of its method may differ
+    reference: Reference  # what its policy is compared with: data and behaviour policy
     measures: dict[str, float | None]
     """Encoder, critic and cost measures: action_loss, PROBES, CRITIC, COSTS; None if unknown."""
     parts: tuple[str, str] = ("", "")
@@ -126,22 +115,18 @@ class Run:
 
     @property
     def record(self) -> Row:
-        """config.json: stage, config, versions, git_commit, command, inputs."""
         return self.result.record
 
     @property
     def stage(self) -> str:
-        """ "pretrain", "finetune" or "navigation"."""
         return self.record["stage"]
 
     @property
     def method(self) -> str:
-        """Its method, without the variant."""
         return self.labels["method"]
 
     @property
     def set_name(self) -> str:
-        """Task and quality."""
         return f"{self.labels['task']} {self.labels['quality']}"
 
     @property
@@ -151,16 +136,13 @@ class Run:
 
     @cached_property
     def named(self) -> Row:
-        """Values of IDENTITY."""
         return {name: self.variant if name == "variant" else self.labels[name] for name in IDENTITY}
 
     def of(self, names: Iterable[str]) -> tuple[Any, ...]:
-        """Values of some columns of IDENTITY."""
         return tuple(self.named[name] for name in names)
 
     @property
     def end_to_end(self) -> bool:
-        """Whether its encoder was trained with the policy."""
         return bool(self.result.encoder.get("end_to_end")) or self.method in END_TO_END
 
     @cached_property
@@ -182,7 +164,6 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has finished without diverging."""
         return self.result.finished and self.result.diverged is None
 
     @property
@@ -235,8 +216,7 @@ def labels(table: pd.DataFrame) -> pd.Series:
 def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choice = ALL) -> list[Run]:
     """The chosen runs at or below some run folders and results folders; `but` as in `find_results`.
 
-    Raises:
-        UserError: there is no run, two have the same identity, or a file of one is damaged.
+    UserError if there is no run, two have the same identity, or a file of one is damaged.
     """
     runs = _told_apart([_load(result) for result in choice.among(find_results(paths, but))])
     seen: dict[tuple[Any, ...], Path] = {}

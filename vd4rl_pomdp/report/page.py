@@ -32,12 +32,9 @@ from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_certificates, refuse_loss, write_results
 
-MARK = "summary"
-"""The table that every report has; its file identifies a report's folder."""
-WIDEST = 6
-"""Maximum methods side by side in a matrix; further ones go below."""
-SEEDS = 12
-"""Maximum seeds that are listed individually."""
+MARK = "summary"  # the table that every report has; its file identifies a report's folder
+WIDEST = 6  # maximum methods side by side in a matrix; further ones go below
+SEEDS = 12  # maximum seeds that are listed individually
 Tables = dict[str, pd.DataFrame]
 Shown = dict[str, tuple[pd.DataFrame, list[Block]]]
 Plots = dict[str, list[Plot]]
@@ -71,18 +68,9 @@ def claim_of(row: Row) -> str:
     return row["claim"] + (f" ({row['family']})" if row["family"] else "")
 
 
-def _p(row: Row) -> str:
-    """A p value, and the one adjusted for its family."""
-    if pd.isna(row["p"]):
-        return number(None)
-    told = "" if pd.isna(row["adjusted_p"]) else f" ({row['adjusted_p']:.3f})"
-    return f"{row['p']:.3f}{told}"
-
-
-def _smallest(row: Row) -> str:
-    """The smallest detectable difference, also as a percentage of the data's return."""
-    share = "" if pd.isna(row["smallest_share"]) else f" ({100 * row['smallest_share']:.0f}%)"
-    return number(row["smallest"], 0) + share
+def _two(value: float | None, other: float | None, digits: int, unit: str = "") -> str:
+    """A number, and another one in brackets if it is known."""
+    return number(value, digits) + ("" if pd.isna(other) else f" ({number(other, digits)}{unit})")
 
 
 SHOWN: dict[str, Columns] = {
@@ -104,8 +92,10 @@ SHOWN: dict[str, Columns] = {
         "left": lambda row: f"{row['left']}: {row['left_return']:.0f} (n = {row['left_seeds']})",
         "right": lambda row: f"{row['right']}: {row['right_return']:.0f} (n = {row['right_seeds']})",
         "difference": ("difference", "low", "high", 0),
-        "p (Holm)": _p,
-        "would be found": _smallest,
+        "p (Holm)": lambda row: _two(row["p"], row["adjusted_p"], 3),
+        "would be found": lambda row: _two(
+            row["smallest"], row["smallest_share"] and 100 * row["smallest_share"], 0, "%"
+        ),
         "played clean": ("clean_difference", "clean_low", "clean_high", 0),
     },
     "lead": {
@@ -199,7 +189,7 @@ NOTES = {
 
 def shown_tables(made: Tables) -> Shown:
     """The page's tables, by the base name of their files: their texts, as in the LaTeX file, and as displayed."""
-    needed = {"control": ["data_return", "clean_return"], "critics": ["critic_value"]}  # else nothing new is told
+    needed = {"control": ["data_return", "clean_return"], "critics": ["critic_value"]}  # else nothing new is shown
     found = {}
     for name, columns in SHOWN.items():
         rows = made[name]
@@ -248,24 +238,17 @@ class Report(NamedTuple):
 
     page: Path
     summary: pd.DataFrame
-    """Table of final scores."""
     gates: list[Row]
-    """Gates that must pass before methods are ranked, by setting."""
     claims: list[Row]
-    """The paper's claims and their verdicts, by setting."""
-    unlike: list[str]
-    """Warnings, as sentences, about results that were made with different data or code."""
+    unlike: list[str]  # warnings about results that were made with different data or code
 
 
 def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     """Write a report of the runs at or below `paths` into `out`; `choice` narrows them.
 
     The folder is also a results folder, so the report can be rebuilt from it alone. A study that `vd4rl-pomdp theory`
-    wrote at or below `paths` becomes a section of the page.
-
-    Raises:
-        UserError: there is nothing to report, a file is damaged, or `out` holds something else or finished runs that
-            this report lacks.
+    wrote at or below `paths` becomes a section of the page. UserError if there is nothing to report, a file is damaged,
+    or `out` holds something else or finished runs that this report lacks.
     """
     refuse_foreign(out, "report", f"{MARK}.csv", RUNS)
     runs = load.load_runs(paths, out, choice)
@@ -350,39 +333,38 @@ def _write(out: Path, made: Tables, shown: Shown, plots: Plots) -> None:
     for name, table in made.items():
         if len(table):
             figures.write_table(out / f"{name}.csv", table)
-        else:
-            (out / f"{name}.csv").unlink(missing_ok=True)
     for name, (table, _) in shown.items():
         if len(table):
             write_latex(out / f"{name}.tex", table, WORDS.get(name, 1) + (name not in WHOLE), NOTES.get(name, ""))
-        else:
-            (out / f"{name}.tex").unlink(missing_ok=True)
     drawn = {plot.name: plot for group in plots.values() for plot in group}
     for plot in drawn.values():
         figures.save_plot(folder, plot)
-    for path in folder.iterdir():
-        of_report = path.suffix in (".csv", ".png", ".pdf") and path.stem.partition("_")[0] in plots
-        if of_report and path.stem not in drawn:
-            path.unlink()
+    gone = [out / f"{name}.csv" for name, table in made.items() if table.empty]
+    gone += [out / f"{name}.tex" for name, (table, _) in shown.items() if table.empty]
+    own = (path for path in folder.iterdir() if path.suffix in (".csv", ".png", ".pdf"))
+    gone += [path for path in own if path.stem.partition("_")[0] in plots and path.stem not in drawn]
+    for path in gone:
+        path.unlink(missing_ok=True)
 
 
 def unlike(runs: list[Run]) -> list[str]:
     """Sentences about compared runs that differ in a dataset's content or in a plug-in's code."""
-    told: dict[str, dict[str, set[str]]] = {}
+    found: dict[str, dict[str, set[str]]] = {}
     played = [run for run in runs if run.stage == "finetune" and run.rows]
     own = {name for name, mine in groups(played, lambda run: run.set_name).items() if load.a_set_a_seed(mine)}
     for run in played:
-        content = "" if run.set_name in own else str(run.record.get("inputs", {}).get("data", ""))[:12]
-        states = {f"the set of {run.set_name} has {{}} contents": content}
-        states |= {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
+        states = {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
+        if run.set_name not in own:
+            states = {f"the set of {run.set_name} has {{}} contents": run.result.data[:12]} | states
         for subject, state in states.items():
             if state:
-                told.setdefault(subject, {}).setdefault(state, set()).add(label(run.named))
-    sentences = []
-    for subject, known in told.items():
-        words = "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in known.items())
-        sentences += [f"{subject.format(len(known))}: {words}"] if len(known) > 1 else []
-    return sentences
+                found.setdefault(subject, {}).setdefault(state, set()).add(label(run.named))
+    return [
+        f"{subject.format(len(known))}: "
+        + "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in known.items())
+        for subject, known in found.items()
+        if len(known) > 1
+    ]
 
 
 def _code(run: Run) -> dict[str, str]:
@@ -402,7 +384,7 @@ def _code(run: Run) -> dict[str, str]:
 
 def _facts(name: str, runs: list[Run]) -> dict[str, str]:
     """What all seeds of a condition share, and what they were computed with."""
-    seeds = sorted({str(run.labels["seed"]) for run in runs}, key=lambda seed: (len(seed), seed))
+    seeds = [str(seed) for seed in sorted({int(run.labels["seed"]) for run in runs})]
     shown = seeds if len(seeds) <= SEEDS else [*seeds[:3], "...", seeds[-1]]
     seconds = [value for run in runs if (value := run.measures["finetune_seconds"]) is not None]
     first = runs[0].record

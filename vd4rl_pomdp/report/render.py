@@ -15,8 +15,7 @@ from vd4rl_pomdp.core.text import one_line
 from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.runs.files import Row, write_bytes
 
-SENTENCE = 48
-"""Characters above which a LaTeX column wraps."""
+SENTENCE = 48  # characters above which a LaTeX column wraps
 SYMBOLS = {"→": r"$\rightarrow$", "†": r"\dag{}", "–": "--", "×": r"$\times$"}
 Columns = dict[str, str | tuple[str, int] | tuple[str, str, str, int] | Callable[[Row], str]]
 """Columns of a displayed table by title. Each shows a row's text, a number with a given number of digits, a number with
@@ -52,8 +51,7 @@ class Block(NamedTuple):
     title: str
     html: str
     rows: int
-    note: str
-    """Its sample size n."""
+    note: str  # its sample size n
 
 
 def block(title: str, table: pd.DataFrame, words: int, note: str = "") -> Block:

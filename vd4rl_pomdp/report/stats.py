@@ -16,20 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
-FEW_SEEDS = 5
-"""Intervals of fewer seeds are flagged."""
-REPLICATES = 20_000
-"""Bootstrap samples per interval."""
+FEW_SEEDS = 5  # intervals of fewer seeds are flagged
+REPLICATES = 20_000  # bootstrap samples per interval
 LEVEL, POWER = 0.05, 0.8
 """Two-sided level of all tests and intervals, and the power that defines the smallest detectable difference."""
-_LEVELS = (2.5, 97.5)
-"""Percentiles of a 95% interval."""
+_LEVELS = (2.5, 97.5)  # percentiles of a 95% interval
 
 Interval = tuple[float, float]
-Statistic = Callable[[np.ndarray], np.ndarray]
-"""(..., runs) scores -> (...) values."""
-Strata = list[np.ndarray]
-"""Scores by seed, one (n_i,) array per task."""
+Statistic = Callable[[np.ndarray], np.ndarray]  # (..., runs) scores -> (...) values
+Strata = list[np.ndarray]  # scores by seed, one (n_i,) array per task
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
@@ -80,14 +75,11 @@ class Estimate:
     """A mean or a difference of two means, for Student's t."""
 
     value: float
-    error: float
-    """Standard error."""
-    free: float
-    """Degrees of freedom."""
+    error: float  # standard error
+    free: float  # degrees of freedom
 
     @property
     def interval(self) -> Interval:
-        """95% interval."""
         reach = float(stdtrit(self.free, 1 - LEVEL / 2)) * self.error
         return self.value - reach, self.value + reach
 
@@ -110,14 +102,12 @@ def mean_interval(scores: np.ndarray) -> Interval | None:
     of seeds and then episodes, corrected for few seeds. None for a single seed, or if all scores are equal, since that
     says nothing about the spread over seeds.
     """
-    found = _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])
-    return found.interval if found else None
+    return found.interval if (found := _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])) else None
 
 
 def difference_interval(scores: np.ndarray, others: np.ndarray) -> Interval | None:
     """Like `mean_interval`, for the mean of (n, episodes) scores minus that of (m, episodes) others."""
-    found = difference(scores, others)
-    return found.interval if found else None
+    return found.interval if (found := difference(scores, others)) else None
 
 
 def difference(scores: np.ndarray, others: np.ndarray) -> Estimate | None:

@@ -15,17 +15,12 @@ from vd4rl_pomdp.report import load, stats
 from vd4rl_pomdp.report.load import CONDITION, COSTS, IDENTITY, SETTING, gaps_in_words, labels
 from vd4rl_pomdp.runs.files import Row
 
-SCORE = "Score = return / 10 or the task's own divisor"
-"""Explanation of scores on tables and pages."""
-SERIES = CONDITION[2:]
-"""Columns shared by a method's runs on all tasks."""
-THRESHOLDS = 101
-"""Number of scores at which a performance profile is computed."""
-MANY = 2_000
-"""Bootstrap samples per interval in a profile or matrix, which have many."""
+SCORE = "Score = return / 10 or the task's own divisor"  # explanation of scores on tables and pages
+SERIES = CONDITION[2:]  # columns shared by a method's runs on all tasks
+THRESHOLDS = 101  # number of scores at which a performance profile is computed
+MANY = 2_000  # bootstrap samples per interval in a profile or matrix, which have many
 AGGREGATES = ("iqm", "median", "mean", "optimality_gap")
-POINTS = 200
-"""Maximum points of a loss curve."""
+POINTS = 200  # maximum points of a loss curve
 ENDS = ("", "_low", "_high")
 
 

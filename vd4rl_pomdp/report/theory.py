@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import UndefinedError
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
@@ -21,7 +20,6 @@ from vd4rl_pomdp.report.render import render
 from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
 
 Study = dict[str, Any]
-"""Return value of `studies.theory.theory_study`."""
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
 LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
@@ -123,7 +121,14 @@ def diagram_figure(study: Study) -> Figure:
     positions = [(radius * sin(angle * pi / 2), radius * cos(angle * pi / 2)) for radius, angle in rings]
     for axes, diagram in zip(figure.subplots(2, 3).flat, study["diagrams"], strict=True):
         for start, action, end in study["transitions"]:
-            _arrow(axes, positions[start], positions[end], action)
+            colour, bend = "#222222" if action > 0 else "#999999", -0.18
+            style = {"arrowstyle": "-|>", "color": colour, "shrinkA": 12, "shrinkB": 12}
+            style["connectionstyle"] = f"arc3,rad={bend}"
+            axes.annotate("", positions[end], positions[start], arrowprops=style, zorder=1)
+            (x0, y0), (x1, y1) = positions[start], positions[end]
+            dx, dy = x1 - x0, y1 - y0
+            out = bend / 2 - 0.13 / hypot(dx, dy)  # the label is at mid-curve
+            axes.text((x0 + x1) / 2 + out * dy, (y0 + y1) / 2 - out * dx, f"{action:+d}", color=colour, **LABEL)
         for (x, y), (at, last), group in zip(positions, study["states"], diagram["classes"], strict=True):
             axes.scatter([x], [y], s=480, color=COLOURS[group % len(COLOURS)], zorder=2)
             axes.text(x, y, f"{at},{last:+d}", color="white", ha="center", va="center", fontsize=8, zorder=3)
@@ -132,17 +137,6 @@ def diagram_figure(study: Study) -> Figure:
         axes.set(xlim=(-1.45, 1.45), ylim=(-1.45, 1.45), aspect="equal")
         axes.axis("off")
     return figure
-
-
-def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], action: int) -> None:
-    """A curved arrow, labelled with its action at mid-curve; +1 and -1 differ in colour."""
-    bend, colour = -0.18, ("#222222" if action > 0 else "#999999")
-    style = {"arrowstyle": "-|>", "color": colour, "shrinkA": 12, "shrinkB": 12, "connectionstyle": f"arc3,rad={bend}"}
-    axes.annotate("", end, start, arrowprops=style, zorder=1)
-    (x0, y0), (x1, y1) = start, end
-    dx, dy = x1 - x0, y1 - y0
-    out = bend / 2 - 0.13 / hypot(dx, dy)
-    axes.text((x0 + x1) / 2 + out * dy, (y0 + y1) / 2 - out * dx, f"{action:+d}", color=colour, **LABEL)
 
 
 def entropy_figure(rows: list[Row]) -> Figure:

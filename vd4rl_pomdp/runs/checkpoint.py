@@ -23,8 +23,7 @@ from vd4rl_pomdp.runs.files import synchronise, write_bytes
 
 KEPT = 2
 """Checkpoints to keep. If the newest is damaged, only the steps since the one before are lost."""
-State = dict[str, Any]
-"""Nested dicts, lists and tuples of tensors, numbers, strings and None."""
+State = dict[str, Any]  # nested dicts, lists and tuples of tensors, numbers, strings and None
 
 
 class Checkpoints:
@@ -35,29 +34,29 @@ class Checkpoints:
 
     def add(self, step: int, state: State, seconds: float) -> None:
         """Save a state reached after `seconds` as the checkpoint of `step`, and delete all but the newest KEPT."""
+        content = pack({"format": FORMAT, "seconds": round(seconds, 2), "state": state})
         with disk_errors(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
-            write_bytes(self._path(step), pack({"format": FORMAT, "seconds": round(seconds, 2), "state": state}))
+            write_bytes(self._folder / f"{step}.pt", content)
             synchronise(self._folder)  # before deleting the oldest: otherwise a power cut could lose both
             self.prune(KEPT)
 
     def restore(self, take: Callable[[State], None]) -> float | None:
         """Pass the newest undamaged state to `take`; return the run's seconds then, or None without checkpoints.
 
-        Raises:
-            UserError: all checkpoints are damaged or unreadable, or belong to another format or run.
+        UserError if all checkpoints are damaged or unreadable, or belong to another format or run.
         """
         # Disks corrupt files; falling back to the previous checkpoint beats starting over.
         damaged: dict[Path, str] = {}
-        for path in map(self._path, self.steps()):
-            content = read_bytes(path)
+        for step in self.steps():
+            content = read_bytes(path := self._folder / f"{step}.pt")
             try:
                 found = unpack(content)
             except Exception as error:  # zipfile and torch raise anything on a damaged file
                 damaged[path] = first_line(error)
                 continue
             for other, problem in damaged.items():
-                print(f"warning: {other}: is damaged ({problem}); resuming from step {path.stem}", file=sys.stderr)
+                print(f"warning: {other}: is damaged ({problem}); resuming from step {step}", file=sys.stderr)
             if (stored := found["format"]) != FORMAT:
                 raise UserError(
                     f"{path}: is a checkpoint of format {stored}, this version writes format {FORMAT} and cannot "
@@ -83,19 +82,14 @@ class Checkpoints:
     def prune(self, kept: int) -> None:
         """Delete all but the newest `kept` checkpoints, and leftovers of interrupted writes."""
         with disk_errors(self._folder):
-            for path in [*self._folder.glob(".*.tmp"), *map(self._path, self.steps()[kept:])]:
+            for path in [*self._folder.glob(".*.tmp"), *(self._folder / f"{step}.pt" for step in self.steps()[kept:])]:
                 path.unlink()
 
     def steps(self) -> list[int]:
         """Steps that have a checkpoint, newest first."""
         with disk_errors(self._folder):
-            files = self._folder.iterdir() if self._folder.is_dir() else ()
-            return sorted(
-                (int(path.stem) for path in files if path.suffix == ".pt" and path.stem.isdecimal()), reverse=True
-            )
-
-    def _path(self, step: int) -> Path:
-        return self._folder / f"{step}.pt"
+            files = [*self._folder.iterdir()] if self._folder.is_dir() else []  # glob would hide errors
+        return sorted((int(one.stem) for one in files if one.suffix == ".pt" and one.stem.isdecimal()), reverse=True)
 
 
 def pack(state: State) -> bytes:

@@ -8,14 +8,12 @@ import numpy as np
 
 from vd4rl_pomdp.runs.metrics import Metrics
 
-VALUE = "q"
-"""Name under which algorithms log the critic's mean value over a batch."""
+VALUE = "q"  # name under which algorithms log the critic's mean value over a batch
 TOLD = {"value", "moved", "data"}
 """Keys of critic.json for an algorithm with a critic; for others it is empty."""
 CONVERGED = 0.02
 """A critic has converged if its value moved by less than this fraction over the last fifth of the updates."""
-FEWEST = 3
-"""Minimum number of rows for the line fit: two points always fit."""
+FEWEST = 3  # minimum number of rows for the line fit: two points always fit
 
 
 def critic_of(
@@ -27,7 +25,7 @@ def critic_of(
         rows: rows of metrics; VALUE is a mean over the updates since the previous row.
         updates: total updates of the training.
         mean_reward: mean reward per decision in the data.
-        gamma: the critic's discount per decision; None if the algorithm has no such option.
+        gamma: discount per decision; None if the algorithm has none.
 
     Returns:
         `value`: mean of VALUE over the rows of the last fifth of the updates.
@@ -36,12 +34,12 @@ def critic_of(
         `data`: discounted return of the data, mean_reward / (1 - gamma): the value of the behaviour policy in a
             task that never ends, for any `n_step`. None if unknown.
     """
-    told = [(row["step"], row[VALUE]) for row in rows if VALUE in row and row["step"] > updates - updates / 5]
-    if not told:
+    last = [(row["step"], row[VALUE]) for row in rows if VALUE in row and row["step"] > updates - updates / 5]
+    if not last:
         return {}
-    steps, values = np.array(told, dtype=float).T
+    steps, values = np.array(last, dtype=float).T
     value, moved, data = values.mean(), None, None
-    if len(told) >= FEWEST and value:
+    if len(last) >= FEWEST and value:
         apart = steps - steps.mean()
         moved = float(round(apart @ values / (apart @ apart) * updates / 5 / value, 6))
     if mean_reward is not None and gamma is not None and gamma < 1:

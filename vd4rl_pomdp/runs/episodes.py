@@ -25,8 +25,7 @@ COLUMNS = (
 def append_episodes(path: Path, rows: list[Row]) -> None:
     """Append rows to an `episodes.csv`, created with a header if needed. No rows: check that it is writable.
 
-    Raises:
-        UserError: the file cannot be written, is of another kind, or is damaged. It is left unchanged.
+    UserError if it cannot be written, is of another kind, or is damaged; it is left unchanged.
     """
     there = read_episodes(path)
     with appending(path) as file:
@@ -39,12 +38,9 @@ def append_episodes(path: Path, rows: list[Row]) -> None:
 def read_episodes(path: Path) -> list[Row]:
     """Rows of an `episodes.csv` with numbers parsed, others left as text; none if it is missing or empty.
 
-    Raises:
-        UserError: the file was not written by this package, or is damaged.
+    UserError if the file was not written by this package, or is damaged.
     """
-    if not regular(path).is_file():
-        return []
-    return _parse(path, read_bytes(path))
+    return _parse(path, read_bytes(path)) if regular(path).is_file() else []
 
 
 def episodes_until(path: Path, step: int) -> list[Row]:

@@ -16,8 +16,7 @@ from typing import IO, Any, TypeVar
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 
-Row = dict[str, Any]
-"""One row of a table: values by column."""
+Row = dict[str, Any]  # one row of a table: values by column
 Member = TypeVar("Member")
 Key = TypeVar("Key", bound=Hashable)
 
@@ -75,13 +74,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
     """Yield a hidden temporary path next to `path`, renamed to `path` when the block ends and deleted if it fails.
 
-    Args:
-        path: the file.
-        shared: whether other processes may write it at the same time. Each then uses its own temporary name, which is
-            left behind if the process is killed.
-
-    Raises:
-        UserError: the disk is full, or the system refuses for another reason.
+    If several processes may write it at once (`shared`), each has its own temporary name, which is left behind if the
+    process is killed. UserError if the disk is full, or the system refuses for another reason.
     """
     own = f".{secrets.token_hex(4)}" if shared else ""
     fresh = path.with_name(f".{path.name}{own}.tmp")
@@ -99,10 +93,7 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 def appending(path: Path) -> Iterator[IO[str]]:
     """Append to a text file, flushed to disk when the block ends since checkpoints rely on it.
 
-    Concurrent writers wait for each other where the file system supports locks.
-
-    Raises:
-        UserError: the system refuses.
+    Concurrent writers wait for each other where the file system supports locks. UserError if the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
         with suppress(OSError):  # some file systems have no locks

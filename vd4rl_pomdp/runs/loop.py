@@ -18,8 +18,7 @@ from vd4rl_pomdp.runs.run import RunFolder
 class Learner(Protocol):
     """What a loop trains."""
 
-    step: int
-    """Steps done so far."""
+    step: int  # steps done so far
 
     def state(self) -> State:
         """Everything needed to resume bit-identically."""
@@ -53,7 +52,6 @@ class Loop:
         return self._learner.step % every == 0 or self._learner.step == self._total
 
     def add(self, logs: dict[str, Tensor]) -> None:
-        """Add the scalars of the step just done to the next row of metrics."""
         self._means.add(logs)
 
     def log(self, *shown: str, **more: float) -> None:
@@ -63,14 +61,13 @@ class Loop:
         """
         row = self._means.take() | more
         self._log.write(self._learner.step, row)
-        self.show(**{name: row[name] for name in shown or row})
+        self._progress.advance(0, **{name: row[name] for name in shown or row})
 
     def log_evaluation(self, row: dict[str, float]) -> None:
         """Write the results of an evaluation after the step just done; names begin with `metrics.EVALUATION`."""
         self._log.write(self._learner.step, row)
 
     def show(self, **numbers: float) -> None:
-        """Show numbers in the progress line."""
         self._progress.advance(0, **numbers)
 
     def require_finite(self, module: nn.Module) -> None:
@@ -80,10 +77,7 @@ class Loop:
 
 
 def in_step(loops: Sequence[Loop], until: int) -> Iterator[int]:
-    """Yield step numbers up to `until` for several loops whose learners are trained in lockstep by one body.
-
-    Loops may be removed from `loops` while it runs.
-    """
+    """Yield step numbers up to `until` for loops trained in lockstep by one body, which may remove some of them."""
     while loops and loops[0]._learner.step < until:
         yield loops[0]._learner.step + 1
         for loop in loops:
@@ -116,14 +110,8 @@ def training(
 ) -> Iterator[Loop]:
     """Restore a learner from the run's newest checkpoint and open its logs. Signals wait for the end of a step.
 
-    Args:
-        run: the run.
-        learner: what is trained.
-        title: title of the progress line; empty: no progress line.
-        total: step at which the loop ends.
-        unit: unit of the progress line.
-        labels: names of the run for trackers: method, task, quality, corruption.
-        card: pretraining metadata of the encoder that the run uses, if any.
+    The progress line has `title` and `unit`; without a title there is none. Trackers get the `labels` (method, task,
+    quality, corruption) and `card`, the pretraining metadata of the encoder that the run uses.
     """
     means = Means()
 

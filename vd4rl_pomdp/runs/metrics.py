@@ -12,8 +12,9 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -26,17 +27,13 @@ from vd4rl_pomdp.runs.files import appending, write_bytes
 from vd4rl_pomdp.runs.run import RunFolder, recipe
 
 WandbMode = Literal["off", "offline", "online"]
-EVALUATION = "eval/"
-"""Prefix of an evaluation's metrics: eval/return/CORRUPTION, eval/score/CORRUPTION."""
+EVALUATION = "eval/"  # prefix of an evaluation's metrics: eval/return/CORRUPTION, eval/score/CORRUPTION
 PROJECT = "vd4rl-pomdp"
 INIT_TIMEOUT_S, FINISH_TIMEOUT_S = 30.0, 60.0
 """Seconds that wandb may wait for its server before the first row and after the last one."""
-LONGEST = {"name": 128, "group": 128, "tags": 64}
-"""Maximum lengths that wandb accepts, in characters."""
-_MOST_ADDED = 1024
-"""Steps buffered before their scalars are summed."""
-Metrics = Mapping[str, float]
-"""One row: `step`, and numbers by name."""
+LONGEST = {"name": 128, "group": 128, "tags": 64}  # maximum lengths that wandb accepts, in characters
+_MOST_ADDED = 1024  # steps buffered before their scalars are summed
+Metrics = Mapping[str, float]  # one row: `step`, and numbers by name
 
 
 class Means:
@@ -51,8 +48,7 @@ class Means:
     def add(self, logs: dict[str, Tensor]) -> None:
         """Add a step's scalars, each a one-element tensor, without a GPU sync.
 
-        Raises:
-            UserError: a scalar's name is reserved.
+        UserError if a scalar's name is reserved.
         """
         if taken := [name for name in logs if name == "step" or name.startswith(EVALUATION)]:
             raise UserError(
@@ -80,30 +76,17 @@ class Means:
         self._added = []
 
     def take(self) -> dict[str, float]:
-        """Return the means and reset."""
         self._sum()
         means = {name: float(total) / steps for name, (total, steps) in self._sums.items()}
         self._sums = {}
         return means
 
     def state_dict(self) -> dict[str, tuple[Tensor, int]]:
-        """State for `load_state_dict`."""
         self._sum()
         return dict(self._sums)
 
     def load_state_dict(self, state: dict[str, tuple[Tensor, int]]) -> None:
-        """Resume from `state_dict`."""
         self._sums, self._added = {name: (total, steps) for name, (total, steps) in state.items()}, []
-
-
-class Mirror(Protocol):
-    """Receives the rows written to metrics.jsonl; opening it hands over all rows so far."""
-
-    def write(self, row: Metrics) -> None:
-        """Take a row."""
-
-    def close(self) -> None:
-        """Send what is left."""
 
 
 class MetricsLog:
@@ -113,20 +96,20 @@ class MetricsLog:
     """
 
     def __init__(
-        self, path: Path, step: int, mirrors: Mapping[str, Callable[[Sequence[Metrics]], Mirror]] | None = None
+        self, path: Path, step: int, mirrors: Mapping[str, Callable[[Sequence[Metrics]], Any]] | None = None
     ) -> None:
         """Open or reopen at the step from which the run resumes; `mirrors` open by name, given all rows up to there."""
         self._path = path
         # The checkpoint's step is trained but not yet evaluated.
-        kept = [
+        rows = [
             row
             for row in read_metrics(path)
             if row["step"] < step or (row["step"] == step and not any(name.startswith(EVALUATION) for name in row))
         ]
-        write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
-        self._mirrors: dict[str, Mirror] = {}
-        for name, opened in (mirrors or {}).items():
-            if (mirror := self._try(name, lambda opened=opened: opened(kept))) is not None:  # type: ignore[misc]
+        write_bytes(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+        self._mirrors: dict[str, Any] = {}
+        for name, open_mirror in (mirrors or {}).items():
+            if (mirror := self._try(name, open_mirror, rows)) is not None:
                 self._mirrors[name] = mirror
 
     def write(self, step: int, metrics: Metrics) -> None:
@@ -138,16 +121,15 @@ class MetricsLog:
         with appending(self._path) as file:
             file.write(json.dumps(row) + "\n")
         for name, mirror in list(self._mirrors.items()):
-            self._try(name, lambda mirror=mirror: mirror.write(dict(row)))  # type: ignore[misc]
+            self._try(name, mirror.write, row)
 
     def close(self) -> None:
-        """Close the mirrors."""
         for name, mirror in list(self._mirrors.items()):
             self._try(name, mirror.close)
 
-    def _try(self, name: str, act: Callable[[], Any]) -> Any:
+    def _try(self, name: str, act: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            return act()
+            return act(*arguments)
         except Exception as error:  # services and their libraries raise anything
             self._mirrors.pop(name, None)
             reason = in_one_line(error) or type(error).__name__
@@ -159,8 +141,7 @@ class MetricsLog:
 def read_metrics(path: Path) -> list[dict[str, float]]:
     """Rows of a metrics.jsonl; empty without a file. A truncated last line is skipped.
 
-    Raises:
-        UserError: a line is damaged.
+    UserError if a line is damaged.
     """
     if not path.exists():
         return []
@@ -176,14 +157,12 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
 
 def mirrors_of(
     run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]
-) -> dict[str, Callable[[Sequence[Metrics]], Mirror]]:
+) -> dict[str, Callable[[Sequence[Metrics]], Any]]:
     """Functions that open the mirrors enabled in a run's config; `card` is its encoder's pretraining record, if any."""
-    found: dict[str, Callable[[Sequence[Metrics]], Mirror]] = {}
-    if run.config["wandb"] != "off":
-        found["wandb"] = lambda rows: Wandb(run, labels, card, rows)
-    if run.config["tensorboard"]:
-        found["TensorBoard"] = lambda rows: TensorBoard(run.path / "tensorboard", rows)
-    return found
+    wandb = {"wandb": partial(Wandb, run, labels, card)} if run.config["wandb"] != "off" else {}
+    return wandb | (
+        {"TensorBoard": partial(TensorBoard, run.path / "tensorboard")} if run.config["tensorboard"] else {}
+    )
 
 
 class Wandb:
@@ -225,11 +204,9 @@ class Wandb:
                 self.write(row)
 
     def write(self, row: Metrics) -> None:
-        """Log a row."""
         self._run.log(dict(row))
 
     def close(self) -> None:
-        """Upload what is left."""
         self._run.finish()
 
 
@@ -265,7 +242,6 @@ class TensorBoard:
             self.write(row)
 
     def write(self, row: Metrics) -> None:
-        """Append and flush a row."""
         for name, value in row.items():
             if name != "step":
                 summary = self._scalar(name, value)
@@ -273,5 +249,4 @@ class TensorBoard:
         self._writer.flush()
 
     def close(self) -> None:
-        """Close the file."""
         self._writer.close()

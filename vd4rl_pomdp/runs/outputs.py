@@ -40,12 +40,9 @@ def refuse_kept(out: Path) -> None:
 
 
 def refuse_foreign(out: Path, what: str, *marks: str) -> None:
-    """Raise UserError unless a folder is missing, empty, or was written by the same command before.
+    """Raise UserError unless a folder is missing, empty but for hidden files, or holds one of the `marks`.
 
-    Args:
-        out: folder to write.
-        what: what the command writes, for the message.
-        marks: files that the command leaves; any of them identifies the folder. Hidden files do not count.
+    `marks` are files that identify what the command wrote before; `what` names it.
     """
     refuse_kept(out)
     if _names(out) and not any((out / mark).is_file() for mark in marks):
@@ -71,8 +68,8 @@ def kept_in(folder: Path) -> str | None:
             record = None
         if isinstance(record, dict) and "stage" in record:
             return "a run"
-    is_set = "collection.json" in names or any(name.lower().endswith((".hdf5", ".h5")) for name in names)
-    return "a data set" if is_set else None
+    is_shard = (name.lower().endswith((".hdf5", ".h5")) for name in names)
+    return "a data set" if "collection.json" in names or any(is_shard) else None
 
 
 def _names(folder: Path) -> list[str]:
@@ -80,8 +77,8 @@ def _names(folder: Path) -> list[str]:
     try:
         return [name for name in os.listdir(folder) if not name.startswith(".")]
     except OSError as error:
-        if isinstance(told := disk_error(folder, error), UnavailableError):
-            raise told from error
+        if isinstance(problem := disk_error(folder, error), UnavailableError):
+            raise problem from error
         return []
 
 
@@ -89,8 +86,7 @@ def _names(folder: Path) -> list[str]:
 def owned(folder: Path) -> Iterator[None]:
     """Create and lock a folder, and handle signals as `interrupt` does. The lock of a killed process is released.
 
-    Raises:
-        UserError: another process, which the message names, owns it, or it cannot be written.
+    UserError if another process, which the message names, owns it, or it cannot be written.
     """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -101,11 +97,9 @@ def owned(folder: Path) -> Iterator[None]:
             owner = (folder / LOCK).read_text(encoding="utf-8") or "another process"
             raise UserError(f"{folder}: is in use by {owner}; wait until it ends, or choose another folder") from None
     try:
-        since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        owner = f"process {os.getpid()} on {socket.gethostname()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S UTC}"
         with disk_errors(folder):
-            (folder / LOCK).write_text(
-                f"process {os.getpid()} on {socket.gethostname()} since {since}", encoding="utf-8"
-            )
+            (folder / LOCK).write_text(owner, encoding="utf-8")
         with handled():
             yield
     finally:

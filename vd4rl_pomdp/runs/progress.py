@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from datetime import timedelta
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console
@@ -42,23 +41,18 @@ class ProgressLine:
         self._task = self._bar.add_task(title, total=total, completed=start, speed="", note="")
         self._note = ""
         self._clock, self._first = clock, (start, clock())
-        self._plain = self._first
-        """Progress and time at the last plain line."""
+        self._plain = self._first  # progress and time at the last plain line
 
     def advance(self, amount: int = 1, **numbers: float) -> None:
-        """Advance by `amount`, and show `numbers` if given."""
         self._done += amount
         self._bar.advance(self._task, amount)
         if numbers:
             self._note = "  ".join(f"{k} {v:.4g}" for k, v in numbers.items())
             self._bar.update(self._task, note=self._note)
-        speed = self._bar.tasks[0].speed
-        if speed:
+        if speed := self._bar.tasks[0].speed:
             self._bar.update(self._task, speed=f"{speed:.3g} {self._unit}/s")
-        if amount and self._shown and not self._console.is_terminal:
-            self._print_now_and_then()
-
-    def _print_now_and_then(self) -> None:
+        if not amount or not self._shown or self._console.is_terminal:
+            return
         now = self._clock()
         done, then = self._plain
         a_tenth_on = self._done - done >= max(1, (self._total - self._first[0]) // self._PLAIN_LINES)
@@ -76,7 +70,5 @@ class ProgressLine:
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bar.stop()

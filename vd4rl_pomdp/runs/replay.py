@@ -24,10 +24,8 @@ Logs = dict[str, Tensor]
 Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
 """Takes a function without running it; returns a function that replays it, and the tensor that then holds its
 result."""
-EAGER_VARIABLE = "VD4RL_POMDP_EAGER"
-"""If set to 1, no step is replayed."""
-WARM_UP = 3
-"""Eager steps per turn before capture: libraries pick kernels and optimisers create their state."""
+EAGER_VARIABLE = "VD4RL_POMDP_EAGER"  # if set to 1, no step is replayed
+WARM_UP = 3  # eager steps per turn before capture: libraries pick kernels and optimisers create their state
 
 
 class Replay:
@@ -55,7 +53,7 @@ class Replay:
         self._step, self._streams, self._period, self._trained = step, streams, period, trained
         self._side = torch.cuda.Stream(device) if device.type == "cuda" else None
         if capture is None and self._side is not None and os.environ.get(EAGER_VARIABLE) != "1":
-            capture = CudaCapture(self._side)
+            capture = _cuda_graphs(self._side)
         self._capture = capture
         self._eager = 0
         self._steps: dict[int, tuple[Callable[[], None], list[str], Tensor]] = {}
@@ -72,6 +70,7 @@ class Replay:
             if self._capture is None:
                 return self._step(turn)
             if turn not in self._steps and not self._ready(turn):
+                self._eager += 1
                 return self._run(turn)
             for stream in self._streams:
                 stream.provide(turn)
@@ -80,7 +79,6 @@ class Replay:
             return dict(zip(names, values.clone().unbind(), strict=True))
 
     def _run(self, turn: int) -> Logs:
-        self._eager += 1
         for stream in self._streams:
             stream.begin(turn)
         logs = self._step(turn)
@@ -102,33 +100,25 @@ class Replay:
             for each in range(self._period):
                 self._steps[each] = self._captured(each)
         except Exception as error:  # any failure: run eagerly instead
-            self._give_up(first_line(error))
-            return False
-        return True
+            self._capture, self._steps = None, {}
+            for stream in self._streams:
+                stream.one_by_one()
+            line = "warning: steps are run one by one, not replayed as a CUDA graph, which is slower: "
+            print(line + first_line(error), file=sys.stderr, flush=True)
+        return self._capture is not None
 
     def _captured(self, turn: int) -> tuple[Callable[[], None], list[str], Tensor]:
         assert self._capture is not None
         names: list[str] = []
 
         def step() -> Tensor:
-            for stream in self._streams:
-                stream.begin(turn)
-            logs = self._step(turn)
-            for stream in self._streams:
-                stream.end()
+            logs = self._run(turn)
             names.extend(logs)
             # one number each, or one per run in a stack
             return torch.stack([value.detach().float().squeeze() for value in logs.values()])
 
         replay, values = self._capture(step)
         return replay, names, values
-
-    def _give_up(self, reason: str) -> None:
-        self._capture, self._steps = None, {}
-        for stream in self._streams:
-            stream.one_by_one()
-        line = f"warning: steps are run one by one, not replayed as a CUDA graph, which is slower: {reason}"
-        print(line, file=sys.stderr, flush=True)
 
     @contextmanager
     def _on_side(self) -> Iterator[None]:
@@ -143,19 +133,18 @@ class Replay:
         current.wait_stream(self._side)
 
 
-class CudaCapture:
-    """Captures functions as CUDA graphs in a shared memory pool, which is safe as they are replayed in sequence."""
+def _cuda_graphs(stream: torch.cuda.Stream) -> Capture:
+    """Capture as CUDA graphs in a shared memory pool, which is safe as they are replayed in sequence."""
+    pool = torch.cuda.graph_pool_handle()
 
-    def __init__(self, stream: torch.cuda.Stream) -> None:
-        self._stream, self._pool = stream, torch.cuda.graph_pool_handle()
-
-    def __call__(self, function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
-        """See `Capture`."""
+    def capture(function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
         graph = torch.cuda.CUDAGraph()
         # thread_local: ignore GPU work of other threads
-        with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
+        with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
             result = function()
         return graph.replay, result
+
+    return capture
 
 
 def python_state(objects: Sequence[Any]) -> dict[str, Any]:
@@ -194,7 +183,6 @@ def changed_in(before: dict[str, Any], after: dict[str, Any]) -> str:
     """Name of an attribute that changed, or ""."""
     for name in before.keys() | after.keys():
         one, other = before.get(name), after.get(name)
-        same = one is other if isinstance(one, Tensor) or isinstance(other, Tensor) else one == other
-        if not same:
+        if one is not other if isinstance(one, Tensor) or isinstance(other, Tensor) else one != other:
             return name
     return ""

@@ -51,32 +51,23 @@ NOT_CERTIFIED = "not certified"
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
 DAMAGED = "its files are damaged", "take another copy, or leave it out"
 """Message for a run whose files do not hold what a run writes."""
-_ROUNDING = 1e-4
-"""Tolerance of a score; scores and returns are stored with four decimals."""
+_ROUNDING = 1e-4  # tolerance of a score; scores and returns are stored with four decimals
 
 
 @dataclass(frozen=True)
 class Result:
     """One run, finished or not, from its own folder or a results folder."""
 
-    id: str
-    """Hash of what the run computes, see `runs.run.identity`."""
-    path: Path
-    """Its folder, or the results folder that lists it."""
-    files: dict[str, dict[str, Any]]
-    """Contents of those FILES that it has."""
-    step: int
-    """Last step in its metrics; 0 if there are none."""
-    losses: list[tuple[int, float]]
-    """Step and action loss over a pretraining."""
-    rows: list[Row]
-    """Evaluation rows, one per episode."""
-    folder: bool = False
-    """Whether `path` is its own folder."""
+    id: str  # hash of what the run computes, see `runs.run.identity`
+    path: Path  # its folder, or the results folder that lists it
+    files: dict[str, dict[str, Any]]  # contents of those FILES that it has
+    step: int  # last step in its metrics; 0 if there are none
+    losses: list[tuple[int, float]]  # step and action loss over a pretraining
+    rows: list[Row]  # evaluation rows, one per episode
+    folder: bool = False  # whether `path` is its own folder
 
     @property
     def place(self) -> str:
-        """Where it is stored, for messages."""
         return str(self.path) if self.folder else f"{self.path}: run {self.id}"
 
     @property
@@ -145,12 +136,11 @@ class Result:
 
     @property
     def measured(self) -> list[Row]:
-        """Its results: evaluation rows, or the measures of a navigation run."""
+        """Evaluation rows, or the measures of a navigation run."""
         return self.rows or self.files.get("results", {}).get("rows", [])
 
     @property
     def finished(self) -> bool:
-        """Whether the run has finished."""
         return "timing" in self.files
 
     @property
@@ -159,14 +149,9 @@ class Result:
         return self.files.get("diverged")
 
     @property
-    def settled(self) -> bool:
-        """Whether it has finished or diverged."""
-        return self.finished or self.diverged is not None
-
-    @property
     def ending(self) -> int:
         """Rank of its end: 0 none yet, 1 diverged, 2 finished."""
-        return self.settled + self.finished
+        return 2 if self.finished else int(self.diverged is not None)
 
 
 def read_records(folder: Path) -> Result:
@@ -200,20 +185,15 @@ def read_run(folder: Path | str) -> Result:
             raise UserError(f"{path}: has {what}; {remedy(folder)}")
         if files.get("critic") == {} and any(VALUE in row for row in metrics):
             raise UserError(f"{folder / CRITIC_FILE}: has no critic, {METRICS_FILE} has one; {remedy(folder)}")
-        files["labels"] = files.get("labels", {}) | _labels(run)
-        return replace(run, id=_id(run))
-
-
-def _labels(run: Result) -> dict[str, Any]:
-    """A run's labels: from its rows, its labels.json or else its config, as far as known."""
-    known = run.rows[0] if run.rows else run.files.get("labels")
-    if known is not None:
+        known = rows[0] if rows else files.get("labels")
+        if known is None:  # not begun: as far as its config says
+            config = {"method": folder.name} | {name: run.encoder.get(name) for name in ("task", "quality")}
+            config |= run.record["config"]
+            known = {name: config.get(name) or "" for name in LABELS} | {"seed": config["seed"]}
         if missing := [name for name in LABELS if name not in known]:
-            raise UserError(f"{run.path / FILES['labels']}: has no {missing[0]!r}; {remedy(run.path)}")
-        return {name: known[name] for name in LABELS}
-    told = {"method": run.path.name, "task": run.encoder.get("task"), "quality": run.encoder.get("quality")}
-    told |= run.record["config"]
-    return {name: told.get(name) or "" for name in LABELS if name != "seed"} | {"seed": told["seed"]}
+            raise UserError(f"{folder / FILES['labels']}: has no {missing[0]!r}; {remedy(folder)}")
+        files["labels"] = files.get("labels", {}) | {name: known[name] for name in LABELS}
+        return replace(run, id=_id(run))
 
 
 def _id(run: Result) -> str:
@@ -226,12 +206,11 @@ def _id(run: Result) -> str:
 
 def _check(run: Result) -> None:
     """Check the types of a run's essential parts; raises KeyError, TypeError or AttributeError."""
-    if not all(isinstance(part, dict) for part in (*run.files.values(), *run.parts, run.record["config"], run.encoder)):
+    config, stage = run.record["config"], run.record["stage"]
+    if not all(isinstance(part, dict) for part in (*run.files.values(), *run.parts, config, run.encoder)):
         raise TypeError("a part of it is not a JSON object")
-    if "seed" not in run.record["config"]:
-        raise TypeError("its record holds no settings")
-    if not isinstance(run.record["stage"], str):
-        raise TypeError(f"its stage is {run.record['stage']!r}")
+    if "seed" not in config or not isinstance(stage, str):
+        raise TypeError(f"its record holds no settings, or its stage is {stage!r}")
     critic = run.files.get("critic", {})
     if critic.keys() - TOLD or any(not (fits(v, float | None) and math.isfinite(v or 0)) for v in critic.values()):
         raise TypeError(f"its {CRITIC_FILE} is {critic}")
@@ -293,10 +272,8 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     """Every run at or below some paths, without duplicates, from run folders and results folders.
 
     Results folders nested in another one belong to other experiments and are read only if named themselves; the results
-    folder `but` is skipped unless it is in `paths`.
-
-    Raises:
-        UserError: a path is missing, there is no run, two runs with one id have different rows, or a file is damaged.
+    folder `but` is skipped unless it is in `paths`. UserError if a path is missing, there is no run, two runs with one
+    id have different rows, or a file is damaged.
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
@@ -318,7 +295,7 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     found: dict[str, Result] = {}
     for run in runs:
         other = found.setdefault(run.id, run)
-        if other.settled and other.ending == run.ending and other.measured != run.measured:
+        if other.ending and other.ending == run.ending and other.measured != run.measured:
             raise UserError(f"{run.path} and {other.path}: two runs of one method, setting and seed; name one of them")
         # Of two copies of a run, prefer a finished, then a diverged one; then a run folder; then the one further along.
         found[run.id] = max(other, run, key=lambda one: (one.ending, one.folder, len(one.measured), one.step))
@@ -329,30 +306,27 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
     """Append the runs at or below some paths to a results folder, and return a summary in words.
 
     Existing rows never change, except that an unfinished run is replaced by its finished or diverged version, and a
-    diverged one by its finished version.
-
-    Raises:
-        UserError: as `find_results`, or `out` holds something else, is damaged or in use.
+    diverged one by its finished version. UserError as in `find_results`, or if `out` holds something else or is in use.
     """
     out = Path(out)
     refuse_foreign(out, "results", RUNS, "README.md", "grid.toml")  # page and grid may exist before the first run
     found = find_results(paths, out)
     with owned(out):
-        there = _kept(out)
-        settled = [run for run in found if run.settled]
-        fresh = {run.id: run for run in settled if run.id not in there or run.ending > there[run.id].ending}
+        there = _stored(out)
+        ended = [run for run in found if run.ending]
+        fresh = {run.id: run for run in ended if run.id not in there or run.ending > there[run.id].ending}
         if fresh:
             write_results(out, (there | fresh).values())
         keep_certificates(out, certificates_of(found, map(Path, paths), out))
-    again = [run for run in settled if run.id not in fresh]
+    again = [run for run in ended if run.id not in fresh]
     known = sum(run.measured == there[run.id].measured for run in again)
-    told = {
+    counts = {
+        f"run{'s' * (len(fresh) != 1)} added": len(fresh) or "0",
         "there already": known,
         "there already with other rows, which stay (remove their lines to replace them)": len(again) - known,
-        "unfinished and left out": len(found) - len(settled),
+        "unfinished and left out": len(found) - len(ended),
     }
-    more = [f"{number} {what}" for what, number in told.items() if number]
-    return ", ".join([f"{len(fresh)} run{'s' * (len(fresh) != 1)} added", *more])
+    return ", ".join(f"{number} {what}" for what, number in counts.items() if number)
 
 
 def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
@@ -363,8 +337,7 @@ def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
 def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
     """All certificates at or below some folders, by id; the newest of duplicates. The own file of `but` is skipped.
 
-    Raises:
-        UserError: a file is damaged.
+    UserError if a file is damaged.
     """
     found: dict[str, Row] = {}
     for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
@@ -397,7 +370,7 @@ def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | 
     return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
 
 
-def _kept(out: Path) -> dict[str, Result]:
+def _stored(out: Path) -> dict[str, Result]:
     """The runs of a results folder by id; empty before the first one."""
     return {run.id: run for run in read_results(out)} if (out / RUNS).exists() else {}
 
@@ -407,12 +380,9 @@ def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
 
     Ids must match the recorded settings, seed, data and format. Episodes must be exactly those that the settings ask
     for, with the run's labels; environment seeds must match episode numbers, and scores their returns.
-
-    Raises:
-        UserError: as `read_results`.
     """
     runs = read_results(folder)
-    return runs, [f"run {run.id}: {told}" for run in runs for told in _contradictions(run)]
+    return runs, [f"run {run.id}: {problem}" for run in runs for problem in _contradictions(run)]
 
 
 def _contradictions(run: Result) -> Iterator[str]:
@@ -481,8 +451,8 @@ def _astray(run: Result) -> Iterator[str]:
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
     """Raise UserError if writing runs as the results folder `out` would lose finished or diverged runs, or rows."""
-    there = [run for run in _kept(out).values() if run.settled]
-    written = {run.id: run for run in runs if run.settled}
+    there = [run for run in _stored(out).values() if run.ending]
+    written = {run.id: run for run in runs if run.ending}
     if lost := [run for run in there if run.id not in written]:
         what = "name the folder among those to report, remove it, or choose another --out"
         raise UserError(f"{out}: holds the results of {len(lost)} runs that would be lost; {what}")

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from vd4rl_pomdp.core.errors import UserError
@@ -24,8 +23,6 @@ from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import content_hash, holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
-
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def remedy(folder: Path) -> str:
@@ -67,8 +64,8 @@ class RunFolder:
         config: Any,
         inputs: dict[str, str],
         results: Sequence[str] = (),
-        parts: Mapping[str, str] = _NOTHING,
-        collection: Mapping[str, Any] = _NOTHING,
+        parts: Mapping[str, str] = {},
+        collection: Mapping[str, Any] = {},
         words: Sequence[str] | None = None,
     ) -> None:
         """Check the folder; writes nothing.
@@ -77,7 +74,7 @@ class RunFolder:
             path: the folder.
             stage: the stage's name.
             config: the stage's settings, a dataclass.
-            inputs: hashes of the run's inputs by name: the data's fingerprint, the encoder's hash.
+            inputs: hashes by name: the data's fingerprint, the encoder's hash.
             results: files that a finished run must have.
             parts: plug-ins that the inputs use, by the registries' `setting`, e.g. an encoder's corruption.
             collection: how the data were collected, for the record.
@@ -91,9 +88,8 @@ class RunFolder:
         self.config: dict[str, Any] = jsonable(flat(config))
         self.inputs = inputs
         self.stage = stage
-        self._checkpoints = Checkpoints(path)
+        self._checkpoints, self._stack = Checkpoints(path), ExitStack()
         self._started, self._before = time.monotonic(), 0.0
-        self._stack = ExitStack()
         self._results, self._collection, self._words = results, dict(collection), words
         self._parts = self.config | parts
         self._check()
@@ -129,9 +125,9 @@ class RunFolder:
             raise UserError(f"{self.path / lost}: is gone; {remedy(self.path)}")
 
     def __enter__(self) -> Self:
-        kept = {} if self._begins else read_json(self.path / CONFIG_FILE)
+        record = {} if self._begins else read_json(self.path / CONFIG_FILE)
         what = "this run began, which resumes or counts all the same; remove the run to compute it anew"
-        warn_of_other_code(self.path, kept, self._parts, what)
+        warn_of_other_code(self.path, record, self._parts, what)
         if not self.finished:
             self._stack.enter_context(owned(self.path))
             try:
@@ -158,23 +154,20 @@ class RunFolder:
         if self._begins or not path.exists():  # a start may have been killed between the two files
             write_json(path, hardware)
         else:
-            told, began = read_json(path), read_json(self.path / CONFIG_FILE)
+            first, began = read_json(path), read_json(self.path / CONFIG_FILE)
             if began["config"] != (config := began["config"] | self.config):  # of flags that may change
                 write_json(self.path / CONFIG_FILE, began | {"config": config})
-            later = told.pop(CONTINUED, [])
+            later = first.pop(CONTINUED, [])
             code = {name: began.get(name, {}) for name in now}  # versions, commit, and origin of plug-ins
-            if (told | code | (later[-1] if later else {})) != hardware | now:
-                write_json(path, told | {CONTINUED: [*later, hardware | now]})
+            if (first | code | (later[-1] if later else {})) != hardware | now:
+                write_json(path, first | {CONTINUED: [*later, hardware | now]})
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
 
     @property
     def finished(self) -> bool:
-        """Whether the run has finished."""
         return (self.path / TIMING_FILE).exists()
 
     @property
@@ -185,8 +178,7 @@ class RunFolder:
     def restore(self, take: Callable[[State], None]) -> None:
         """Pass the newest undamaged checkpoint's state to `take`, if there is one.
 
-        Raises:
-            UserError: it does not fit the run, or there are evaluations but no checkpoint.
+        UserError if it does not fit the run, or there are evaluations but no checkpoint.
         """
         seconds = self._checkpoints.restore(take)
         # The run would start over and append the same evaluations again.
@@ -198,7 +190,6 @@ class RunFolder:
         self._before = seconds or 0.0
 
     def save(self, step: int, state: State) -> None:
-        """Save the state after a step as the newest checkpoint."""
         self._checkpoints.add(step, state, self.seconds)
 
     def mark_diverged(self, step: int, message: str) -> None:

@@ -51,40 +51,29 @@ class _Pool:
         self._executor.shutdown(cancel_futures=True)
 
 
-_kept: list[_Pool] = []
-"""Idle workers of at most one pool."""
+_idle: list[_Pool] = []  # at most one pool
 _keeping = False
 
 
 @contextmanager
 def kept_workers() -> Iterator[None]:
-    """Within the block, workers stay alive between calls of `run_jobs`.
-
-    This saves start-up time and keeps their open environments, e.g. for the successive evaluations of a training.
-    """
+    """Within the block, workers stay alive between calls of `run_jobs`, with their open environments."""
     global _keeping
     before, _keeping = _keeping, True
     try:
         yield
     finally:
         _keeping = before
-        if not _keeping:
-            _close_kept()
-
-
-def _close_kept() -> None:
-    while _kept:
-        _kept.pop().close()
+        if _idle and not _keeping:
+            _idle.pop().close()
 
 
 def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     """Yield function(job) for every job, in order.
 
     Workers are fresh single-threaded processes that inherit no GL context or thread pool; under `kept_workers` they may
-    be reused. With one worker, everything runs in the calling process. 0 means one worker per core.
-
-    Raises:
-        UserError: a worker died, or a job cannot be pickled. Exceptions of jobs are re-raised here.
+    be reused. With one worker, everything runs in the calling process. 0 means one worker per core. UserError if a
+    worker died, or a job cannot be pickled. Exceptions of jobs are re-raised here.
     """
     workers = min(count_workers(workers), len(jobs))
     if workers <= 1:
@@ -97,9 +86,9 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
             f"a job cannot be sent to a worker process ({first_line(error)}): define its classes and functions in a "
             "module, or use --workers 1"
         ) from error
-    if _kept and not _kept[0].serves(workers):
-        _close_kept()
-    pool, done = _kept.pop() if _kept else _Pool(workers), False
+    if _idle and not _idle[0].serves(workers):
+        _idle.pop().close()
+    pool, done = _idle.pop() if _idle else _Pool(workers), False
     try:
         yield from pool.map(function, jobs)
         done = True
@@ -111,17 +100,15 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
             "use fewer --workers and re-run the same command"
         ) from None
     finally:
-        if done and _keeping and not _kept:
-            _kept.append(pool)
+        if done and _keeping and not _idle:
+            _idle.append(pool)
         else:
             pool.close()
 
 
 def count_workers(workers: int) -> int:
     """`workers`, or the number of usable cores if 0."""
-    if workers:
-        return workers
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def _start_worker() -> None:

@@ -26,12 +26,9 @@ from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, say
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
-LOOK_S = 15.0
-"""Seconds between polls of the cluster."""
-ANSWER_S = 30.0
-"""Timeout of a command to the cluster, seconds."""
-VAIN = 3
-"""Resubmissions without any progress before the sweep gives up."""
+LOOK_S = 15.0  # seconds between polls of the cluster
+ANSWER_S = 30.0  # timeout of a command to the cluster, seconds
+VAIN = 3  # resubmissions without any progress before the sweep gives up
 
 
 @dataclass(frozen=True)
@@ -39,11 +36,9 @@ class ClusterTask:
     """What runs on a node: a driver that helps with a sweep."""
 
     out: Path
-    plan: str
-    """Name of the plan; empty: all plans in the folder."""
+    plan: str  # name of the plan; empty: all plans in the folder
     options: LocalOptions
-    cwd: str
-    """Working directory, to which relative paths refer."""
+    cwd: str  # working directory, to which relative paths refer
 
     def __call__(self) -> None:
         """Run unclaimed jobs until none is left. SIGTERM and SIGUSR2 (Slurm's warning) end it gracefully."""
@@ -63,14 +58,8 @@ class ClusterTask:
 def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFolder, name: str) -> bool:
     """Keep a sweep's tasks on the cluster until no job can run any more. Return whether all jobs are finished.
 
-    Args:
-        plans: their jobs are run.
-        cluster: where to run; its nodes see run and dataset folders at the same paths.
-        folder: the sweep's folder.
-        name: plan name; empty: all plans in the folder.
-
-    Raises:
-        UserError: the cluster rejects the first tasks, or tasks keep ending without progress.
+    The cluster's nodes see all folders at the same paths. `name` is that of the plan; empty: all plans in the folder.
+    UserError if the cluster rejects the first tasks, or tasks keep ending without progress.
     """
     jobs = jobs_of(plans)
     task = ClusterTask(folder.out, name, cluster.local, os.getcwd())
@@ -120,9 +109,7 @@ class SlurmCluster:
     def __init__(self, options: SlurmOptions, folder: Path) -> None:
         """Check that submitit and Slurm's commands are installed, or raise UserError. Slurm is not contacted yet.
 
-        Args:
-            options: resources of a task.
-            folder: where submitit and the tasks write, on a disk shared by all nodes.
+        Submitit and the tasks write into `folder`, on a disk shared by all nodes.
         """
         try:
             import submitit
@@ -144,15 +131,12 @@ class SlurmCluster:
         return len(self._ask("squeue", "--array", "--noheader", "--format=%T").split())
 
     def submit(self, task: ClusterTask, number: int) -> None:
-        """Submit one array; UserError if Slurm rejects it."""
         try:
             with disk_errors(self.folder):
                 self._executor.submit_array([task] * number)
         except RuntimeError as error:  # how submitit reports a failed command
-            lines = str(error).strip().splitlines()
-            raise UserError(
-                f"Slurm rejected the job array ({lines[-1] if lines else 'it does not say why'})"
-            ) from error
+            reason = (str(error).strip() or "it does not say why").splitlines()[-1]
+            raise UserError(f"Slurm rejected the job array ({reason})") from error
 
     def stop(self) -> None:
         """Cancel pending tasks, signal the running ones to checkpoint and exit, and wait for them."""
@@ -169,9 +153,9 @@ class SlurmCluster:
 
     def _ask(self, command: str, *words: str) -> str:
         """Stdout of a Slurm command on this sweep's tasks; UnavailableError if it fails or times out."""
-        told = [command, "--me", f"--name={self._name}", *words]
+        line = [command, "--me", f"--name={self._name}", *words]
         try:
-            answer = subprocess.run(told, capture_output=True, text=True, check=False, timeout=ANSWER_S)
+            answer = subprocess.run(line, capture_output=True, text=True, check=False, timeout=ANSWER_S)
         except subprocess.TimeoutExpired as error:
             raise UnavailableError(f"Slurm does not answer: {command} has not ended after {ANSWER_S:g} s") from error
         if answer.returncode and command == "squeue":  # scancel also fails when there is nothing to cancel
@@ -181,21 +165,18 @@ class SlurmCluster:
 
 def parameters(options: SlurmOptions) -> dict[str, Any]:
     """Task options as submitit's `slurm_*` parameters."""
-    names = ("partition", "account", "qos", "constraint", "time")
-    found = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.gpus:
-        found["gpus_per_node"] = options.gpus
-    if options.memory is not None:
-        found["mem"] = f"{options.memory * 1024:.0f}M"
     further = [parameter.removeprefix("--").partition("=") for parameter in options.sbatch]
-    found |= {
+    found = {
+        **{name: getattr(options, name) for name in ("partition", "account", "qos", "constraint", "time")},
+        "gpus_per_node": options.gpus or None,
+        "mem": None if options.memory is None else f"{options.memory * 1024:.0f}M",
         "cpus_per_task": options.cpus,
         "srun_args": [f"--cpus-per-task={options.cpus}"],  # some Slurm versions do not inherit it from sbatch
         "array_parallelism": options.tasks,
         "signal_delay_s": round(PATIENCE_S + 15),
         "additional_parameters": {"requeue": True} | {name: value or True for name, _, value in further},
     }
-    return {f"slurm_{name}": value for name, value in found.items()}
+    return {f"slurm_{name}": value for name, value in found.items() if value is not None}
 
 
 class RayCluster:
@@ -255,7 +236,6 @@ class RayCluster:
         return len(self._running)
 
     def submit(self, task: ClusterTask, number: int) -> None:
-        """Submit tasks; Ray places them on nodes."""
         run = self._ray.remote(max_retries=0)(lambda: task())  # retries are decided from the sweep's attempt log
         run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
         self._running += [run.remote() for _ in range(number)]

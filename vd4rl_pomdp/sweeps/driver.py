@@ -36,17 +36,13 @@ from vd4rl_pomdp.sweeps.folder import (
     jobs_of,
     lost_among,
 )
-from vd4rl_pomdp.sweeps.options import LocalOptions
-from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
+from vd4rl_pomdp.sweeps.options import JOB_VARIABLE, LocalOptions
 from vd4rl_pomdp.sweeps.plan import Job
 
 POLL_S = 0.5
-PAUSE_S = 60.0
-"""Seconds to wait before a retry, whichever driver made the last attempt."""
-IN_USE_S = 10.0
-"""Seconds before checking again on a job that another driver is running."""
-IDLE_S = 90.0
-"""Seconds after which a helping driver with nothing to start exits."""
+PAUSE_S = 60.0  # seconds to wait before a retry, whichever driver made the last attempt
+IN_USE_S = 10.0  # seconds before checking again on a job that another driver is running
+IDLE_S = 90.0  # seconds after which a helping driver with nothing to start exits
 PATIENCE_S = 120.0
 """Seconds between SIGTERM and SIGKILL, in which a job finishes its step and writes a checkpoint."""
 _ROOT = Path(__file__).parents[2]
@@ -57,34 +53,24 @@ class Place:
     """Cores and GPU of one job."""
 
     cores: tuple[int, ...]
-    gpu: str | None
-    """Value for CUDA_VISIBLE_DEVICES."""
+    gpu: str | None  # value for CUDA_VISIBLE_DEVICES
 
 
 @dataclass(frozen=True)
 class _Running:
-    jobs: list[Job]
-    """More than one: a stack."""
+    jobs: list[Job]  # more than one: a stack
     places: list[Place]
     process: subprocess.Popen
     began: float
     log: Path
-    log_size: int
-    """Size of the log in bytes before this attempt."""
+    log_size: int  # size of the log in bytes before this attempt
 
 
 class Driver:
     """One process that works on a sweep, possibly alongside others."""
 
     def __init__(self, plans: Iterable[Plan], options: LocalOptions, folder: SweepFolder, helps: bool = False) -> None:
-        """See the module.
-
-        Args:
-            plans: their jobs are run, each after the jobs it needs.
-            options: how many jobs this machine runs, and on what.
-            folder: the sweep's folder.
-            helps: whether this driver is one of several, and exits after IDLE_S without work.
-        """
+        """Run the jobs of `plans`; if it only `helps`, it exits after IDLE_S without work."""
         self._plans = {job.name: plan for plan in plans for job in plan.jobs}
         self._jobs = {job.name: job for job in jobs_of(plans)}
         self._left = {name: job for name, job in self._jobs.items() if not is_finished(job)}
@@ -93,15 +79,14 @@ class Driver:
         self._running: list[_Running] = []
         self._not_before: dict[str, float] = {}
         """Earliest time to look at a job again that another driver runs or that just failed."""
-        self._busy = time.monotonic()
-        """Time at which something last ran."""
+        self._busy = time.monotonic()  # time at which something last ran
         self._widths: dict[str, int | None] = {}
         """Feature width by fine-tuning job, known once its encoder exists."""
 
     def run(self) -> bool:
         """Run jobs until none can run any more. Return whether all are finished."""
         try:
-            while self._look():
+            while self._start_ready():
                 time.sleep(POLL_S)
                 self._collect()
                 interrupt.check("the sweep's jobs have ended")
@@ -120,17 +105,17 @@ class Driver:
             raise
         return all(map(is_finished, self._left.values()))  # other drivers may have finished jobs that failed here
 
-    def _look(self) -> bool:
+    def _start_ready(self) -> bool:
         """Start all jobs that can start. Return whether there is anything left to wait for."""
         attempts = self._folder.attempts(self._jobs.values())  # includes other drivers' attempts
         lost = lost_among(self._left.values(), attempts)
         running = {job.name for one in self._running for job in one.jobs}
         ready = []
         for job in self._left.values():
-            rests = self._not_before.get(job.name, 0) > time.monotonic()
+            pauses = self._not_before.get(job.name, 0) > time.monotonic()
             for last in attempts[job.name][-1:]:
-                rests |= last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
-            if not rests and job.name not in lost | running and self._left.keys().isdisjoint(job.needs):
+                pauses |= last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
+            if not pauses and job.name not in lost | running and self._left.keys().isdisjoint(job.needs):
                 ready.append(job)
         processes = self._in_processes(ready, attempts, lost, running) if self._free else []
         for number, jobs in enumerate(processes, 1):
@@ -188,11 +173,11 @@ class Driver:
         place = Place(tuple(sorted({core for one in taken for core in one.cores})), gpu)
         try:
             with disk_errors(log):
-                for job in jobs:
-                    self._log(job).parent.mkdir(parents=True, exist_ok=True)
-                for job in jobs[1:]:
-                    with self._log(job).open("a", encoding="utf-8") as file:
-                        print(f"in one process with {jobs[0].name}: see {log}", file=file)
+                for path in map(self._log, jobs):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    if path != log:
+                        with path.open("a", encoding="utf-8") as file:
+                            print(f"in one process with {jobs[0].name}: see {log}", file=file)
                 size = log.stat().st_size if log.exists() else 0
                 process = start(words_of_stack(jobs), self._plans[jobs[0].name], log, place, self._threads)
         except UserError as error:
@@ -214,10 +199,9 @@ class Driver:
             self._end(one.jobs, cause, time.monotonic() - one.began, line)
 
     def _end(self, jobs: list[Job], cause: str, seconds: float, line: str) -> None:
-        """Record and print the result of an attempt."""
-        told: Row = {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "host": socket.gethostname()}
-        told |= {"log": str(self._log(jobs[0]).relative_to(self._folder.out))}
-        told |= {"stack": len(jobs)} if len(jobs) > 1 else {}
+        shared: Row = {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "host": socket.gethostname()}
+        shared |= {"log": str(self._log(jobs[0]).relative_to(self._folder.out))}
+        shared |= {"stack": len(jobs)} if len(jobs) > 1 else {}
         unfinished = [job for job in jobs if not is_finished(job)]
         if cause == FAILED and any(in_use(job.folder) for job in unfinished):  # lost a race: no attempt
             self._not_before |= {job.name: time.monotonic() + IN_USE_S for job in unfinished}
@@ -232,7 +216,7 @@ class Driver:
                 how, why = cause, line
             if how in PASSING:
                 self._not_before[job.name] = time.monotonic() + PAUSE_S
-            row: Row = {"job": job.name, "cause": how, "line": why, "words": job.words} | told
+            row: Row = {"job": job.name, "cause": how, "line": why, "words": job.words} | shared
             try:
                 self._folder.add(row)
             except UnavailableError as error:
@@ -241,21 +225,15 @@ class Driver:
 
 
 def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:
-    """Start a job's process in the plan's working directory, as the command a user would type.
+    """Start the process `vd4rl-pomdp WORDS` in the plan's working directory, its output appended to `log`.
 
-    Args:
-        words: the command's words after `vd4rl-pomdp`.
-        plan: the job's plan.
-        log: file to which its output is appended.
-        place: the cores and the GPU that it may use.
-        threads: its CPU threads; 0: one per core.
+    `threads` are its CPU threads; 0: one per core of its `place`.
     """
     # One command line per process: anyone can repeat it by hand, a crash or OOM kill takes down nothing else, and the
     # system manages cores, GPU and signals. The exit code is all that the driver learns.
     imports = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
-    told = {JOB_VARIABLE: "1", "PYTHONPATH": imports, "OMP_NUM_THREADS": str(threads or max(1, len(place.cores)))}
-    if place.gpu is not None:
-        told["CUDA_VISIBLE_DEVICES"] = place.gpu
+    own = {JOB_VARIABLE: "1", "PYTHONPATH": imports, "OMP_NUM_THREADS": str(threads or max(1, len(place.cores)))}
+    own |= {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
     program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: do not import from the working directory
     mine = os.sched_getaffinity(0) if place.cores else set()
     # A child inherits affinity and blocked signals. Slurm sends its time-limit warning to every process; only the task
@@ -267,7 +245,7 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
         with log.open("ab") as file:
             return subprocess.Popen(
                 [sys.executable, *program, *words],
-                env=os.environ | told,
+                env=os.environ | own,
                 cwd=plan.made_in,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
@@ -346,16 +324,14 @@ def kind_of(job: Job) -> tuple[str, ...]:
 def width_of(job: Job, made_in: Path) -> int | None:
     """Width of the encoder features that a fine-tuning reads; None if its encoder cannot be read.
 
-    Args:
-        job: the fine-tuning.
-        made_in: directory to which the paths in its command are relative.
+    Paths in its command are relative to `made_in`.
     """
     try:
         encoder = read_record(made_in / job.words[job.words.index("--encoder") + 1]).encoder
     except (ValueError, UserError):
         return None
-    told = {"readout": job.settings["readout"]} if "readout" in job.settings else {}
-    return replace(encoder, **told).dim  # type: ignore[arg-type]
+    own = {"readout": job.settings["readout"]} if "readout" in job.settings else {}
+    return replace(encoder, **own).dim  # type: ignore[arg-type]
 
 
 def runs_alone(rows: Iterable[Row]) -> bool:
@@ -366,21 +342,11 @@ def runs_alone(rows: Iterable[Row]) -> bool:
 def in_stacks(
     jobs: Iterable[Job], size: int, attempts: Mapping[str, list[Row]], alike: Callable[[Job], Hashable] = kind_of
 ) -> list[list[Job]]:
-    """Group jobs by process, in order: stacks of up to `size`, and single jobs.
-
-    Args:
-        jobs: jobs to group.
-        size: maximum jobs per stack.
-        attempts: previous attempts by job name.
-        alike: grouping key; equal for jobs that can share a stack, falsy for a job that runs alone.
-    """
+    """Group jobs by process, in order: stacks of up to `size` with equal keys, and single jobs, whose key is falsy."""
     found = groups(jobs, lambda job: job.name if runs_alone(attempts.get(job.name, ())) else alike(job) or job.name)
     return [group[first : first + size] for group in found.values() for first in range(0, len(group), size)]
 
 
 def words_of_stack(jobs: list[Job]) -> list[str]:
     """The command that runs some jobs in one process, after `vd4rl-pomdp`: the jobs' words joined by "+"."""
-    words = list(jobs[0].words)
-    for job in jobs[1:]:
-        words += ["+", *job.words[1:]]
-    return words
+    return [*jobs[0].words, *(word for job in jobs[1:] for word in ("+", *job.words[1:]))]

@@ -34,19 +34,16 @@ DONE, INTERRUPTED, KILLED, UNAVAILABLE, FAILED = "done", "interrupted", "killed"
 """How an attempt at a job ended."""
 PASSING = (KILLED, UNAVAILABLE)
 """Transient causes, worth a retry. Bad input, a bug or a divergence would only recur."""
-TRIES = 5
-"""Consecutive transient failures after which a job counts as failed."""
-_RETRIED = "retried"
-"""Cause of the row that clears a job's earlier failures."""
+TRIES = 5  # consecutive transient failures after which a job counts as failed
+_RETRIED = "retried"  # cause of the row that clears a job's earlier failures
 RUNNING, WAITING, BLOCKED = "running", "waiting", "blocked"
-_RATE_S = 3600.0
-"""Window in seconds over which the rate of finished jobs is measured."""
+_RATE_S = 3600.0  # window in seconds over which the rate of finished jobs is measured
 
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
     """Name of the plan for a grid file and the words that narrow or change it, e.g. "ladder" or "ladder~1a2b3c4d"."""
-    told = sorted(words)
-    return f"{grid}~{hashlib.blake2b(json.dumps(told).encode(), digest_size=4).hexdigest()}" if told else grid
+    words = sorted(words)
+    return f"{grid}~{hashlib.blake2b(json.dumps(words).encode(), digest_size=4).hexdigest()}" if words else grid
 
 
 @dataclass(frozen=True)
@@ -54,10 +51,8 @@ class Plan:
     """Jobs, and how to start their processes."""
 
     jobs: list[Job]
-    made_in: Path
-    """Working directory of every job, to which relative paths refer."""
-    out: Path
-    """The sweep's folder, as the jobs' commands name it."""
+    made_in: Path  # working directory of every job, to which relative paths refer
+    out: Path  # the sweep's folder, as the jobs' commands name it
     program: list[str]
     """Arguments of `python` instead of `-m vd4rl_pomdp`: the user's own file that registers plug-ins."""
 
@@ -66,10 +61,8 @@ class SweepFolder:
     """The files of a sweep below its folder."""
 
     def __init__(self, out: Path) -> None:
-        """Creates nothing on disk."""
         self.out = out
-        self.path = out / "sweep"
-        """Folder of the sweep's own files."""
+        self.path = out / "sweep"  # folder of the sweep's own files
         self._attempts = self.path / "attempts.jsonl"
 
     def keep_plan(self, name: str, jobs: Iterable[Job], program: Iterable[str] = ()) -> Plan:
@@ -83,25 +76,20 @@ class SweepFolder:
     def plans(self, name: str = "") -> list[Plan]:
         """The plan of that name, or all plans, with job folders resolved relative to `self.out`.
 
-        Raises:
-            UserError: no plan is there, or one is damaged.
+        UserError if no plan is there, or one is damaged.
         """
         paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
         if not paths:
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
-        plans = []
-        for plan in map(read_plan, paths):
-            jobs = [
-                replace(
-                    job,
-                    folder=self.out / job.folder.relative_to(plan.out)
-                    if job.folder.is_relative_to(plan.out)
-                    else plan.made_in / job.folder,  # a set that lies elsewhere
-                )
-                for job in plan.jobs
-            ]
-            plans.append(replace(plan, jobs=jobs))
-        return plans
+
+        def here(plan: Plan, folder: Path) -> Path:
+            inside = folder.is_relative_to(plan.out)  # else a set that lies elsewhere
+            return self.out / folder.relative_to(plan.out) if inside else plan.made_in / folder
+
+        plans = map(read_plan, paths)
+        return [
+            replace(plan, jobs=[replace(job, folder=here(plan, job.folder)) for job in plan.jobs]) for plan in plans
+        ]
 
     def plans_to_do(self, name: str = "") -> list[Plan]:
         """Like `plans`; UserError if the folder was moved, since the jobs' commands still name the old place."""
@@ -133,7 +121,6 @@ class SweepFolder:
                     raise DiskFullError(f"{self._attempts}: the disk is full")
 
     def forget(self, job: str) -> None:
-        """Clear the job's failures, so that it is tried again."""
         self.add({"job": job, "cause": _RETRIED})
 
     def attempts(self, jobs: Iterable[Job]) -> dict[str, list[Row]]:
@@ -231,9 +218,9 @@ def in_lines(found: Mapping[str, Any], out: Path) -> list[str]:
     """A status as lines of text; `out` is the sweep's folder."""
     counts = ", ".join(f"{number} {state}" for state, number in sorted(found["counts"].items()))
     left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
-    shown = [
+    return [
         f"{len(found['states'])} jobs: {counts}",
         f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate",
+        *(failure(row, out) for row in found["failures"].values()),
+        *(f"running: {name}" for name, state in found["states"].items() if state == RUNNING),
     ]
-    shown += [failure(row, out) for row in found["failures"].values()]
-    return shown + [f"running: {name}" for name, state in found["states"].items() if state == RUNNING]

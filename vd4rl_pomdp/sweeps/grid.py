@@ -43,27 +43,22 @@ from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.runs.interrupt import Terminated
 
 GRIDS = Path(__file__).with_name("grids")
-"""The grids that ship with the package."""
 PIXELS = ("collect", "pretrain", "finetune")
 MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
-SHARED = ("seed", "preset")
-"""Settings outside the sections."""
+SHARED = ("seed", "preset")  # settings outside the sections
 _SETS = ("collect", "navigation_collect")
 _TRAININGS = ("pretrain", "finetune", "navigation_train")
-_FOLDERS = {"out", "data", "encoder"}
-"""Settings that the sweep itself fills in."""
+_FOLDERS = {"out", "data", "encoder"}  # settings that the sweep itself fills in
 Values = dict[str, Any]
-Sections = dict[str, Values]
-"""Settings by section; those of SHARED are under ""."""
+Sections = dict[str, Values]  # settings by section; those of SHARED are under ""
 
 
 @dataclass(frozen=True)
 class GridCell:
     """One point of a grid: a dataset, plus the encoder and policy trained on it if the grid has these sections."""
 
-    sections: Sections
-    """Settings, one value each."""
+    sections: Sections  # settings, one value each
     named: Mapping[str, Sequence[str]]
     """By section, settings that distinguish this cell within its grid and so appear in folder names: axes, a block's
     own settings and, for datasets, those set by a `where`."""
@@ -75,19 +70,16 @@ class GridCell:
 
     @property
     def shared(self) -> Values:
-        """Values of SHARED that the grid sets."""
         return self.sections[""]
 
     @property
     def seed(self) -> int:
-        """Seed of its trainings."""
         return self.shared.get("seed", 0)
 
     def value(self, name: str) -> Any:
         """Value of `section.name`, or of `name` in whichever section sets it; None if none does.
 
-        Raises:
-            UserError: sections set `name` to different values.
+        UserError if sections set `name` to different values.
         """
         return _value_of(self.sections, name)
 
@@ -96,8 +88,7 @@ class GridCell:
 class Where:
     """A [[where]] table: overrides for the cells that match its conditions."""
 
-    only: list[str]
-    """Conditions, as in `narrow`."""
+    only: list[str]  # conditions, as in `narrow`
     sections: Sections
 
     def applied(self, cell: GridCell, last: Sections) -> GridCell:
@@ -120,13 +111,10 @@ class Grid:
 
     name: str
     title: str
-    common: Sections
-    """Settings shared by all blocks, axes as lists."""
-    blocks: list[Sections]
-    """Settings of each block's own table."""
+    common: Sections  # settings shared by all blocks, axes as lists
+    blocks: list[Sections]  # settings of each block's own table
     wheres: list[Where]
-    last: Sections
-    """Settings with the highest precedence: from [testing] and --change."""
+    last: Sections  # settings with the highest precedence: from [testing] and --change
 
     def cells(self) -> list[GridCell]:
         """All cells without duplicates, ordered by seed: every condition runs its first seed before any second one."""
@@ -145,25 +133,20 @@ def names() -> list[str]:
 
 
 def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> Grid:
-    """Read a grid.
+    """Read a shipped grid, or a TOML or Python file; UserError if it does not exist or is invalid.
 
-    Args:
-        name: a shipped grid, or the path of a TOML or Python file.
-        changes: overrides for all blocks, e.g. "pretrain.steps=100" or "seed=0,1".
-        testing: whether to apply the grid's [testing] overrides.
-
-    Raises:
-        UserError: the grid does not exist or is invalid.
+    `changes` are overrides for all blocks, e.g. "pretrain.steps=100" or "seed=0,1"; `testing` applies those of
+    [testing].
     """
     path = GRIDS / f"{name}.toml" if name in names() else Path(name)
-    told = _read(path, name)
+    content = _read(path, name)
     try:
-        title, tests = told.pop("title", path.stem), told.pop("testing", {})
-        tables = {name: told.pop(name, []) for name in ("block", "where")}
+        title, tests = content.pop("title", path.stem), content.pop("testing", {})
+        tables = {name: content.pop(name, []) for name in ("block", "where")}
         for kind, found in tables.items():
             if not isinstance(found, list):
                 raise UserError(f"its {kind}s are not a list of tables: write [[{kind}]]")
-        blocks, common = [_sections(block) for block in tables["block"] or [{}]], _sections(told)
+        blocks, common = [_sections(block) for block in tables["block"] or [{}]], _sections(content)
         last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
         whole = [_merge(common, block) for block in blocks]
         for block in whole:
@@ -177,8 +160,7 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
 def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
     """The cells that match all conditions, e.g. "method=mik+a,acro" and "seed=0".
 
-    Raises:
-        UserError: a condition is malformed, or no cell has one of its values.
+    UserError if a condition is malformed, or no cell has one of its values.
     """
     for text in only:
         name, wanted = _condition(text)
@@ -194,14 +176,14 @@ def _read(path: Path, name: str) -> Values:
     try:
         with disk_errors(path):
             text = read_bytes(path).decode()
-            told = tomllib.loads(text) if path.suffix == ".toml" else runpy.run_path(str(path)).get("GRID")
+            content = tomllib.loads(text) if path.suffix == ".toml" else runpy.run_path(str(path)).get("GRID")
     except (UserError, Terminated):
         raise
     except (Exception, SystemExit) as error:  # a Python file may raise anything
         raise UserError(f"{path}: is not a valid grid ({type(error).__name__}: {error}); correct it") from error
-    if not isinstance(told, dict):
+    if not isinstance(content, dict):
         raise UserError(f"{path}: defines no dict called GRID; see the shipped grids for examples")
-    return dict(told)
+    return dict(content)
 
 
 def _sections(table: Any) -> Sections:
@@ -258,8 +240,7 @@ def _check_block(block: Sections) -> None:
     if "finetune" in chain and "pretrain" not in chain:
         raise UserError("a block with finetune needs pretrain, which makes its encoder")
     if chain[0] not in ("collect", "navigation_collect"):
-        kind = "navigation_collect" if chain[0] in MAZES else "collect"
-        raise UserError(f"a block has no dataset: add a section {kind}")
+        raise UserError(f"a block has no dataset: add a section {(MAZES if chain[0] in MAZES else PIXELS)[0]}")
     for section, settings in block.items():
         _check_settings(section, settings)
 

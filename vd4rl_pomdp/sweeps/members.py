@@ -21,19 +21,10 @@ class GridMembers(Choice):
     """The pretraining and fine-tuning runs that a grid's cells ask for."""
 
     def __init__(self, name: str, cells: list[GridCell]) -> None:
-        """Work out what the cells compute.
-
-        Args:
-            name: of the grid, for messages.
-            cells: cells to include.
-
-        Raises:
-            UserError: a cell has invalid settings, or trains in a maze.
-        """
-        self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
+        """Work out what some cells of the grid `name` compute; UserError if one is invalid, or trains in a maze."""
+        self._what = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
-        self._policies: set[tuple[Any, ...]] = set()
-        """Values of LABELS of the policies that the cells train."""
+        self._policies: set[tuple[Any, ...]] = set()  # values of LABELS of the policies that the cells train
         check_cells(cells, name)
         for cell in cells:
             if "navigation_train" in cell.chain:
@@ -50,7 +41,7 @@ class GridMembers(Choice):
         """The runs that belong to the grid, in order; UserError if none does."""
         found = [run for run in with_collections(results) if self._has(run)]
         if not found:
-            raise UserError(f"none of {len(results)} runs is {self._asked}; `sweep run --dry-run` lists the cells")
+            raise UserError(f"none of {len(results)} runs is {self._what}; `sweep run --dry-run` lists the cells")
         return found
 
     def asks(self, row: Row) -> bool:
@@ -59,7 +50,6 @@ class GridMembers(Choice):
 
     @property
     def wanted(self) -> list[Row]:
-        """Labels of the policies that the cells ask for."""
         return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
     def _has(self, run: Result) -> bool:

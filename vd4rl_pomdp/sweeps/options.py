@@ -1,12 +1,19 @@
-"""Options of the sweep executors: this machine, Slurm or Ray."""
+"""Options of the sweep executors (this machine, Slurm, Ray), and the program that starts the jobs."""
 
 from __future__ import annotations
 
+import shlex
+import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.registry import BY_CALL, REGISTRIES, code_of
+
+JOB_VARIABLE = "VD4RL_POMDP_JOB"
+"""Set in the environment of a job's process: a second signal does not kill it early, and it may not start a sweep."""
 
 
 @dataclass(frozen=True)
@@ -87,3 +94,30 @@ class RayOptions(Options):
 
 EXECUTORS: dict[str, type[Options]] = {"local": LocalOptions, "slurm": SlurmOptions, "ray": RayOptions}
 """Options classes by executor name."""
+
+
+def own_program() -> list[str]:
+    """Arguments of `python` that started this process, if a user's file registered plug-ins; else empty."""
+    main = sys.modules["__main__"]
+    if not any(registry.has_added for registry in REGISTRIES.values()):
+        return []
+    if (spec := getattr(main, "__spec__", None)) is not None:
+        return ["-m", spec.name.removesuffix(".__main__")]
+    return [sys.argv[0]] if getattr(main, "__file__", None) else []
+
+
+def program_name(program: list[str] | None = None) -> str:
+    """The command to type instead of `vd4rl-pomdp`, e.g. "python my_method.py"; default: that of this process."""
+    program = own_program() if program is None else program
+    return shlex.join(["python", *program]) if program else "vd4rl-pomdp"
+
+
+def refuse_unknown_to_jobs(settings: Mapping[str, str]) -> None:
+    """Raise UserError if settings name a plug-in that a job's process could not import."""
+    if not own_program():
+        for part, origin in code_of(settings)["plugins"].items():
+            if origin == BY_CALL:
+                raise UserError(
+                    f"{part}: is registered only in this process, but each job is a process of its own: register it in "
+                    "a file that ends in `main()`, and start the sweep with `python FILE sweep run`"
+                )

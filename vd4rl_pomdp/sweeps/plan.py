@@ -29,12 +29,9 @@ from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told
 
-DATA = "data"
-"""Default folder of the datasets, below the sweep's folder."""
-_DOWNLOADED = "84px"
-"""Subfolder that holds the shards of a downloaded dataset."""
-_LONGEST = 160
-"""Maximum bytes of settings in a folder's name (file systems allow 255 in all)."""
+DATA = "data"  # default folder of the datasets, below the sweep's folder
+_DOWNLOADED = "84px"  # subfolder that holds the shards of a downloaded dataset
+_LONGEST = 160  # maximum bytes of settings in a folder's name (file systems allow 255 in all)
 _IN_NAMES = {
     "collect": ("task", "quality"),
     "pretrain": ("method", "corruption"),
@@ -53,8 +50,7 @@ class DataSet:
     folder: Path
     section: str
     """Section of the grid, i.e. the command that collects it."""
-    wanted: Mapping[str, Any]
-    """Collection settings by name."""
+    wanted: Mapping[str, Any]  # collection settings by name
 
     @property
     def foreign(self) -> bool:
@@ -64,7 +60,6 @@ class DataSet:
 
     @property
     def there(self) -> bool:
-        """Whether the dataset is complete."""
         return (self.folder / PROVENANCE).is_file() or self.foreign
 
     @cached_property
@@ -149,23 +144,18 @@ def with_collections(runs: Iterable[Result]) -> list[Result]:
 class Job:
     """One command of a sweep."""
 
-    name: str
-    """Folder of its result below the sweep's folder, or "data/" and the dataset's name."""
+    name: str  # folder of its result below the sweep's folder, or "data/" and the dataset's name
     section: str
     """Section of the grid, i.e. its stage."""
     folder: Path
-    words: list[str]
-    """Its command line after `vd4rl-pomdp`."""
-    needs: list[str] = field(default_factory=list)
-    """Names of the jobs that must finish first."""
+    words: list[str]  # its command line after `vd4rl-pomdp`
+    needs: list[str] = field(default_factory=list)  # names of the jobs that must finish first
     done: bool = False
     """Marks as done a job whose folder cannot show it: a row kept elsewhere, or a dataset not collected here."""
     settings: dict[str, str] = field(default_factory=dict)
     """Its settings and those of the stages before it, as text."""
-    recipe: str = ""
-    """Recipe hash of a training; empty for a dataset."""
-    content: str = ""
-    """Fingerprint of the dataset of a run already in its folder; empty if there was none."""
+    recipe: str = ""  # recipe hash of a training; empty for a dataset
+    content: str = ""  # fingerprint of the dataset of a run already in its folder; empty if there was none
 
     @property
     def finished(self) -> bool:
@@ -179,7 +169,6 @@ class Job:
 
     @property
     def begun(self) -> bool:
-        """Whether its folder holds at least a started run."""
         return (self.folder / (CONFIG_FILE if self.section in STAGES else PLAN)).is_file()
 
 
@@ -214,18 +203,15 @@ class _Planner:
         here = list(runs_below(out))
         self._here, self._kept = (groups(runs, lambda run: run.recipe) for runs in (here, kept))
         self._folders = {run.path for run in here}
-        self._names = {job.name: job.recipe for job in others}
-        """Recipe by name, for names already taken."""
+        self._names = {job.name: job.recipe for job in others}  # recipe by name, for names already taken
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
-        self._asked: set[str] = set()
-        """Names of jobs that end a cell's chain."""
+        self._requested: set[str] = set()  # names of jobs that end a cell's chain
         self._of_other_code: Counter[str] = Counter()
         self._of_other_content: Counter[str] = Counter()
         self._on_other_encoders = 0
 
     def add(self, cell: GridCell) -> None:
-        """Add the jobs of a cell."""
         data = set_of(cell, self._data)
         if data.name not in self._sets:
             data.check()
@@ -240,7 +226,7 @@ class _Planner:
             # A policy's folder name also depends on the encoder's settings.
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
-        self._ask(before[-1], data)
+        self._request(before[-1], data)
 
     def _training(self, cell: GridCell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
         own = recipe_of(cell, section)
@@ -272,11 +258,11 @@ class _Planner:
             one for one in candidates if self._out / one not in self._folders and self._names.get(one, own) == own
         )
 
-    def _ask(self, job: Job, data: DataSet) -> None:
+    def _request(self, job: Job, data: DataSet) -> None:
         """Request a job for its own result, not as a dependency. A finished run among `kept` satisfies it."""
-        if job.name in self._asked:
+        if job.name in self._requested:
             return
-        self._asked.add(job.name)
+        self._requested.add(job.name)
         run = _found(self._kept, job.recipe, data)
         if run is None and any(data.alike(other.record) for other in self._kept.get(job.recipe, ())):
             self._of_other_content[data.name] += 1
@@ -292,7 +278,7 @@ class _Planner:
             if job.name in needed and job.section in STAGES:
                 job = replace(job, done=False)  # a kept row has no encoder to train on
             if not job.finished:
-                if job.name not in needed | self._asked:
+                if job.name not in needed | self._requested:
                     continue
                 needed |= set(job.needs)
             found.append(job)
@@ -320,8 +306,7 @@ def _found(runs: Mapping[str, list[Result]], own: str, data: DataSet) -> Result 
     return max(fitting, key=lambda run: run.finished, default=None)
 
 
-_images_in = cache(source_fingerprint)
-"""Content hash of a maze run's exogenous images, cached."""
+_images_in = cache(source_fingerprint)  # content hash of a maze run's exogenous images, cached
 
 
 def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any]) -> str:

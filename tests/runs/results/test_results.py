@@ -117,8 +117,10 @@ def test_rows_may_come_after_their_page_and_their_grid(tmp_path, name, taken):
     if taken:
         assert add_results([run], tmp_path / "out").startswith("1 run added")
     else:
-        with pytest.raises(UserError, match="is not empty and holds no results"):
+        with pytest.raises(UserError, match="is not empty and holds no results; choose another"):
             add_results([run], tmp_path / "out")
+        with pytest.raises(UserError, match="holds no runs"):
+            read_results(tmp_path / "out")
 
 
 def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tmp_path):
@@ -139,7 +141,7 @@ def test_a_diverged_run_is_a_result(tmp_path):
     write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
     assert add_results([run], tmp_path / "out").startswith("1 run added")
     (found,) = read_results(tmp_path / "out")
-    assert (found.finished, found.settled, found.diverged["step"]) == (False, True, 7)
+    assert (found.finished, found.ending, found.diverged["step"]) == (False, 1, 7)
 
 
 def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(tmp_path):
@@ -262,21 +264,10 @@ def test_a_damaged_results_folder_is_named(tmp_path, name, change, words):
     assert not (tmp_path / "report").exists()
 
 
-def test_results_go_into_no_folder_of_another_kind(tmp_path):
-    run = whole_run(tmp_path / "runs/0")
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "mine.txt").touch()
-    for out in (run, run / "results", tmp_path / "notes"):
-        with pytest.raises(UserError, match="choose another"):
-            add_results([run], out)
-    with pytest.raises(UserError, match="holds no runs"):
-        read_results(tmp_path / "notes")
-
-
 @pytest.mark.parametrize("place", sorted(COMMITTED.rglob("runs.jsonl")), ids=lambda place: place.parent.name)
 def test_committed_runs_say_what_they_were_made_with(place):
     for run in read_results(place.parent):
-        assert run.settled
+        assert run.ending
         learns_no_actions = run.record["config"].get("method") in ("random", "state", "supervised+a")
         assert run.measured or run.losses or learns_no_actions
         assert run.labels["task"]

@@ -60,7 +60,7 @@ def rows_of(
     complete: bool = True,
     physics: np.ndarray | None = None,
 ) -> EpisodeArrays:
-    """Convert an episode with a_t and r_t aligned to o_t into this package's rows, which store a_{t-1} and r_{t-1}.
+    """Convert an episode with a_t and r_t beside o_t to this package's rows, which store a_{t-1} and r_{t-1}.
 
     Args:
         frames: (T + 1, 3, H, W) uint8, o_0 to o_T.
@@ -115,12 +115,7 @@ def as_frames(pictures: np.ndarray) -> np.ndarray:
 
 
 def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[str, tuple[int, int]]:
-    """Name and image size of the observation with the images: the user's choice, else the only candidate.
-
-    Args:
-        shapes: shapes of all uint8 observations, by name.
-        picture: the user's choice, or None.
-    """
+    """Name and image size of one of the uint8 observations with `shapes`: of `picture`, else of the only candidate."""
     known = {name: size for name, shape in shapes.items() if (size := picture_size(shape))}
     if not known:
         raise UserError("holds no images: expected uint8 observations of shape (H, W), (H, W, 3) or (3, H, W)")

@@ -60,19 +60,24 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
     data, filmed = files("data", info["data_path"]), features[key]["dtype"] == "video"
     films = files(f"videos/{key}", info["video_path"]) if filmed else []
-    wanted = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
-    low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), wanted)
+    outcomes = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
+    low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), outcomes)
     tasks = [str(one) for one in pq.read_table(folder / "meta" / "tasks.parquet").to_pandas().index]
     named = tasks[0] if len(tasks) == 1 and re.fullmatch(r"[\w.-]+", tasks[0]) else None
     notes += [f"its task is {one!r}" for one in tasks if len(tasks) == 1 and not named]
 
     def read(first: int) -> Iterator[EpisodeArrays]:
-        columns = ["episode_index", "timestamp", "action", *wanted, *([] if filmed else [key])]
-        for number, told in _stored(data, lengths, columns, first):
+        columns = ["episode_index", "timestamp", "action", *outcomes, *([] if filmed else [key])]
+        for number, stored in _stored(data, lengths, columns, first):
             if filmed:
-                times = episodes[f"videos/{key}/from_timestamp"][number] + told["timestamp"].astype(float)
-            frames = _filmed(films[number], times, info["fps"]) if filmed else _decoded(told[key])
-            yield _rows(told, frames, own)
+                times = episodes[f"videos/{key}/from_timestamp"][number] + stored["timestamp"].astype(float)
+                frames = _filmed(films[number], times, info["fps"])
+            elif None in stored[key]:
+                raise UserError("its images are stored outside data/, which is not supported")
+            else:
+                opened = (Image.open(io.BytesIO(one)) for one in stored[key])
+                frames = _stacked([np.asarray(one if one.mode == "RGB" else one.convert("RGB")) for one in opened])
+            yield _rows(stored, frames, own)
 
     size = sum(file.stat().st_size for file in {*data, *films})
     record = {"set": folder.resolve().name, "picture": key, "bytes": size}
@@ -81,7 +86,6 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
 
 def _info(folder: Path) -> dict[str, Any]:
-    """Read and check meta/info.json."""
     path = folder / "meta" / "info.json"
     if not path.is_file():
         raise UserError("has no meta/info.json, so it is not a local LeRobot dataset; `hf download` fetches one")
@@ -102,8 +106,8 @@ def _episodes(pq: Any, folder: Path, info: dict[str, Any]) -> dict[str, list[Any
     tables = [pq.read_table(file, columns=names) for file in index]
     table = _arrow().concat_tables(tables).sort_by("episode_index").to_pydict() if index else {"length": []}
     for what, found in (("episodes", len(table["length"])), ("frames", sum(table["length"]))):
-        if found != (told := info[f"total_{what}"]):
-            raise UserError(f"meta/episodes has {found} of {told} {what}; fetch it again")
+        if found != (total := info[f"total_{what}"]):
+            raise UserError(f"meta/episodes has {found} of {total} {what}; fetch it again")
     return table
 
 
@@ -121,32 +125,32 @@ def _stored(
                 table, held = held.slice(0, lengths[number]), held.slice(lengths[number])
                 if number < first:
                     continue
-                told = {name: _dense(table[name].combine_chunks()) for name in columns}
-                if len(table) < lengths[number] or (told["episode_index"] != number).any():
+                stored = {name: _dense(table[name].combine_chunks()) for name in columns}
+                if len(table) < lengths[number] or (stored["episode_index"] != number).any():
                     raise UserError(f"{path.name} lacks rows that meta/episodes lists; fetch it again")
-                yield number, told
+                yield number, stored
 
 
-def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
+def _survey(pq: Any, files: list[Path], outcomes: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
     """Action bounds, if actions exceed [-1, 1], and warnings about unusable or missing values."""
     lows, highs, unused, lost, notes = [], [], 0, 0.0, []
     for file in files:
-        table = pq.read_table(file, columns=["episode_index", "action", *wanted])
+        table = pq.read_table(file, columns=["episode_index", "action", *outcomes])
         action = _dense(table["action"].combine_chunks())
         if action.dtype.kind != "f":
             raise UserError(f"its actions are {action.dtype}; expected floating point")
         lows.append(action.min(0))
         highs.append(action.max(0))
         last = np.flatnonzero(np.diff(table["episode_index"].to_numpy(), append=-1))
-        if "next.done" in wanted:  # a row after the terminal one only holds the final image
+        if "next.done" in outcomes:  # a row after the terminal one only holds the final image
             last = last[~table["next.done"].to_numpy()[np.maximum(last - 1, 0)]]
         unused += len(last)
-        if "next.reward" in wanted:
+        if "next.reward" in outcomes:
             lost += float(_dense(table["next.reward"].combine_chunks())[last].sum())
     if unused:
-        rewards = f" and rewards ({lost:g} in all)" if "next.reward" in wanted else ""
+        rewards = f" and rewards ({lost:g} in all)" if "next.reward" in outcomes else ""
         notes.append(f"the last actions{rewards} of {unused} episodes lead to no stored picture and are left out")
-    if "next.reward" not in wanted:
+    if "next.reward" not in outcomes:
         notes.append("it has no rewards: all are 0")
     low, high = np.min(lows, 0).astype(float), np.max(highs, 0).astype(float)
     if max(-low.min(), high.max()) <= 1:
@@ -163,14 +167,6 @@ def _dense(column: Any) -> np.ndarray:
     if hasattr(column, "values"):
         return column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), -1)
     return column.to_numpy(zero_copy_only=False)
-
-
-def _decoded(pictures: np.ndarray) -> np.ndarray:
-    """Decode (T,) image files to (T, 3, H, W) uint8."""
-    if None in pictures:
-        raise UserError("its images are stored outside data/, which is not supported")
-    opened = (Image.open(io.BytesIO(one)) for one in pictures)
-    return _stacked([np.asarray(one if one.mode == "RGB" else one.convert("RGB")) for one in opened])
 
 
 def _stacked(pictures: list[np.ndarray]) -> np.ndarray:
@@ -201,14 +197,14 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
     raise UserError(f"{path.name} has no frame at {times[len(pictures)]:.3f} s; fetch it again")
 
 
-def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:
+def _rows(stored: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:
     """Convert an episode's LeRobot rows to this package's."""
     count = len(frames)
-    done, truncated = (name in told and bool(told[name][-2:-1].any()) for name in ("next.done", "next.truncated"))
-    reward, action = told.get("next.reward", np.zeros(count)).reshape(count)[:-1], told["action"].reshape(count, -1)
-    physics = told["physics"].reshape(count, -1) if "physics" in told else None
+    done, truncated = (name in stored and bool(stored[name][-2:-1].any()) for name in ("next.done", "next.truncated"))
+    reward, action = stored.get("next.reward", np.zeros(count)).reshape(count)[:-1], stored["action"].reshape(count, -1)
+    physics = stored["physics"].reshape(count, -1) if "physics" in stored else None
     rows = rows_of(frames, action[:-1], reward, done and not truncated, done or not own, physics)
-    return rows | ({"discount": np.append(1.0, told[_OWN][:-1])} if own else {})
+    return rows | ({"discount": np.append(1.0, stored[_OWN][:-1])} if own else {})
 
 
 def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = False) -> list[str]:
@@ -216,7 +212,7 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
     size, end, files = source.frame_shape[0], 0, 0
     if video and size % 2:
         raise UserError(f"video needs an even height and width, not {size}: pass --size, or take `lerobot`")
-    png, held, told, changes = _png_encoder(size), list[Any](), list[dict[str, Any]](), list[tuple[float, int]]()
+    png, held, index, changes = _png_encoder(size), list[Any](), list[dict[str, Any]](), list[tuple[float, int]]()
     lost = {f"steps have no duration here: in the export they are {_FPS} a second": None}
     for number, rows in enumerate(source.read(0)):
         if rows["action"][0].any() or rows["reward"][0] or rows["discount"][0] != 1:
@@ -231,19 +227,19 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
             film = folder / _VIDEO.format(video_key=_PICTURE, **_numbered("", number))
             _encode(film, pictures)
             if number % 10 == 0:
-                seen = _filmed(film, columns["timestamp"].astype(float), _FPS)
-                change = np.abs(seen.astype(np.int16) - rows[FRAMES_KEY])
+                decoded = _filmed(film, columns["timestamp"].astype(float), _FPS)
+                change = np.abs(decoded.astype(np.int16) - rows[FRAMES_KEY])
                 changes.append((change.mean(), change.max()))
             where = _numbered("", number) | {"from_timestamp": 0.0, "to_timestamp": len(pictures) / _FPS}
             place |= {f"videos/{_PICTURE}/{name}": value for name, value in where.items()}
         for name, values in (columns | {_PICTURE: rows[FRAMES_KEY][::10]}).items():
             place |= {f"stats/{name}/{kind}": value for kind, value in _stats(values).items()}
-        told.append(place)
+        index.append(place)
         if end == source.rows or sum(table.nbytes for table in held) >= _FILE_MB * 2**20:
             _save(folder / _DATA.format(**_numbered("", files)), held)
             held, files = [], files + 1
-    _save(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", [_arrow().Table.from_pylist(told)])
-    _describe(folder, source, columns, told, video)
+    _save(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", [_arrow().Table.from_pylist(index)])
+    _describe(folder, source, columns, index, video)
     if video:
         mean, most = np.mean([one[0] for one in changes]), max(one[1] for one in changes)
         off = f"values are off by {mean:.2f} of 255 on average, {most} at most"
@@ -288,7 +284,9 @@ def _save(path: Path, tables: list[Any]) -> None:
     _parquet().write_table(_arrow().concat_tables(tables), path, row_group_size=512)
 
 
-def _describe(folder: Path, source: SourceSet, columns: EpisodeArrays, told: list[dict[str, Any]], video: bool) -> None:
+def _describe(
+    folder: Path, source: SourceSet, columns: EpisodeArrays, index: list[dict[str, Any]], video: bool
+) -> None:
     """Write the files in meta/ other than the episodes."""
     size, task = source.frame_shape[0], source.task or _NO_TASK
     coded = {"height": size, "width": size, "codec": "h264", "pix_fmt": "yuv420p", "fps": _FPS, "channels": 3}
@@ -302,18 +300,18 @@ def _describe(folder: Path, source: SourceSet, columns: EpisodeArrays, told: lis
     from pandas import DataFrame, Index  # slow to load
 
     DataFrame({"task_index": [0]}, index=Index([task], name="task")).to_parquet(folder / "meta" / "tasks.parquet")
-    write_json(folder / "meta" / "stats.json", {name: _joined(told, f"stats/{name}/") for name in features})
+    write_json(folder / "meta" / "stats.json", {name: _joined(index, f"stats/{name}/") for name in features})
     described = {
         "codebase_version": "v3.0",
         "robot_type": None,
-        "total_episodes": len(told),
-        "total_frames": told[-1]["dataset_to_index"],
+        "total_episodes": len(index),
+        "total_frames": index[-1]["dataset_to_index"],
         "total_tasks": 1,
         "chunks_size": _CHUNK,
         "data_files_size_in_mb": _FILE_MB,
         "video_files_size_in_mb": 200,
         "fps": _FPS,
-        "splits": {"train": f"0:{len(told)}"},
+        "splits": {"train": f"0:{len(index)}"},
         "data_path": _DATA,
         "video_path": _VIDEO if video else None,
         "features": features,
@@ -325,15 +323,15 @@ def _stats(values: np.ndarray) -> dict[str, list[Any]]:
     """Statistics of a column over rows, or per channel of (N, 3, H, W) images, scaled to [0, 1]."""
     pixels = values.ndim == 4
     flat = values.swapaxes(0, 1).reshape(3, -1) if pixels else values.reshape(len(values), -1).T.astype(float)
-    told = {"min": flat.min(1), "max": flat.max(1), "mean": flat.mean(1), "std": flat.std(1)}
-    shaped = {kind: (value / 255).reshape(3, 1, 1) if pixels else value for kind, value in told.items()}
+    found = {"min": flat.min(1), "max": flat.max(1), "mean": flat.mean(1), "std": flat.std(1)}
+    shaped = {kind: (value / 255).reshape(3, 1, 1) if pixels else value for kind, value in found.items()}
     return {kind: value.tolist() for kind, value in shaped.items()} | {"count": [len(values)]}
 
 
-def _joined(told: list[dict[str, Any]], prefix: str) -> dict[str, list[Any]]:
+def _joined(index: list[dict[str, Any]], prefix: str) -> dict[str, list[Any]]:
     """Combine the episodes' statistics into those of the whole data set."""
     least, most, means, std, count = (
-        np.array([one[prefix + kind] for one in told], float) for kind in ("min", "max", "mean", "std", "count")
+        np.array([one[prefix + kind] for one in index], float) for kind in ("min", "max", "mean", "std", "count")
     )
     share = (count / count.sum()).reshape(-1, *[1] * (means.ndim - 1))
     mean = (share * means).sum(0)

@@ -42,7 +42,7 @@ def read(source: str, picture: str | None) -> SourceSet:
         raise UserError(f"has actions of {actions}, not Box or Discrete")
     spaces = dict(_leaves(dataset.observation_space))
     key, size = chosen({name: space.shape or () for name, space in spaces.items() if space.dtype == np.uint8}, picture)
-    told, spec = json.loads(dataset.storage.metadata.get(_KEY, "{}")), dataset.env_spec
+    metadata, spec = json.loads(dataset.storage.metadata.get(_KEY, "{}")), dataset.env_spec
     notes = []
     if discrete:
         notes.append(f"the {actions.n} discrete actions become as many columns: 1 for the one taken, -1 for the others")
@@ -70,7 +70,7 @@ def read(source: str, picture: str | None) -> SourceSet:
             stored.rewards,
             stored.terminations,
             bool(stored.terminations[-1:].any() or stored.truncations[-1:].any()),
-            stored.infos["physics"] if told.get("physics") else None,
+            stored.infos["physics"] if metadata.get("physics") else None,
         )
 
     bounded = not discrete and actions.is_bounded()
@@ -82,8 +82,8 @@ def read(source: str, picture: str | None) -> SourceSet:
         {"id": dataset.id, "picture": key, "steps": sum(lengths), "minari": dataset.minari_version},
         actions.low.ravel() if bounded else None,
         actions.high.ravel() if bounded else None,
-        told.get("task") or _task(spec),
-        told.get("set"),
+        metadata.get("task") or _task(spec),
+        metadata.get("set"),
         notes,
     )
 
@@ -103,8 +103,8 @@ def _task(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
     if spec is None:
         return None
     own = {name for name, task in TASKS.items() if isinstance(task, GymnasiumTask) and task.environment == spec.id}
-    told = spec.kwargs.get("task") if spec.id.startswith("vd4rl_pomdp/") else None
-    return told or next(iter(own), None)
+    named = spec.kwargs.get("task") if spec.id.startswith("vd4rl_pomdp/") else None
+    return named or next(iter(own), None)
 
 
 def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
@@ -121,8 +121,8 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     pictures = gymnasium.spaces.Box(0, 255, first[FRAMES_KEY].shape[1:], np.uint8)
     actions = gymnasium.spaces.Box(-1.0, 1.0, first["action"].shape[1:], np.float32)
     made = storage.MinariStorage.new(folder / "data", pictures, actions)
-    told = {"task": source.task, "set": source.quality, "physics": "physics" in first}
-    made.update_metadata({"dataset_id": name, "minari_version": minari.__version__, _KEY: json.dumps(told)})
+    metadata = {"task": source.task, "set": source.quality, "physics": "physics" in first}
+    made.update_metadata({"dataset_id": name, "minari_version": minari.__version__, _KEY: json.dumps(metadata)})
     lost: dict[str, None] = {}
     for rows in source.read(0):
         discount, steps = rows["discount"], len(rows["reward"]) - 1
@@ -138,7 +138,7 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
             rewards=rows["reward"][1:],
             terminations=discount[1:] == 0,
             truncations=truncations,
-            infos={"physics": rows["physics"]} if told["physics"] else None,
+            infos={"physics": rows["physics"]} if metadata["physics"] else None,
         )
         made.update_episodes([episode])
     return list(lost)

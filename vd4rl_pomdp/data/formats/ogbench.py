@@ -22,8 +22,8 @@ def read(source: str, picture: str | None) -> SourceSet:
     """Open a file such as visual-cube-single-play-v0.npz."""
     path = Path(source)
     with zipfile.ZipFile(path) as file:
-        if lacking := {"observations", "actions", "terminals"} - {Path(name).stem for name in file.namelist()}:
-            raise UserError(f"has no {min(lacking)!r}, so it is not an OGBench dataset")
+        if missing := {"observations", "actions", "terminals"} - {Path(name).stem for name in file.namelist()}:
+            raise UserError(f"has no {min(missing)!r}, so it is not an OGBench dataset")
     with np.load(path) as file:  # loads only the arrays that are accessed
         action, terminals = file["actions"], file["terminals"].astype(bool)
     with _observations(path) as (_, shape, dtype):

@@ -38,8 +38,7 @@ def read_shards(path: str, picture: str | None = None) -> SourceSet:
             while episode < len(ends) and ends[episode] <= begin + len(held):
                 start, end = starts[episode], ends[episode]
                 if episode >= first:
-                    told = {key: value[start:end] for key, value in rows.items()}
-                    yield {FRAMES_KEY: held[start - begin : end - begin]} | told
+                    yield {FRAMES_KEY: held[start - begin : end - begin]} | {k: v[start:end] for k, v in rows.items()}
                 held, begin, episode = held[end - begin :], end, episode + 1
 
     attributes = [read_attributes(shard) for shard in shards]
@@ -56,42 +55,29 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
         raise UserError(f"{folder}: holds no .npz episodes; name the folder that holds them, such as TASK/QUALITY/64px")
     shape = _episode(files[0])[FRAMES_KEY].shape
     _, frame_shape = chosen({"image": shape[1:]}, picture)
-    named = [re.search(r"-(\d+)$", file.stem) for file in files]
-    rows = sum(int(one[1]) if one else shape[0] for one in named)
-    task, quality = task_and_quality(folder, [])
+    lengths = [re.search(r"-(\d+)$", file.stem) for file in files]
+    rows = sum(int(length[1]) if length else shape[0] for length in lengths)
+    (task, quality), notes = task_and_quality(folder, []), []
+    if "64px" in folder.resolve().parts and len(files) <= 100 and task and quality:  # V-D4RL's paper states more
+        expert = " of the expert alone" if quality == "medium_expert" else ""
+        notes = [
+            f"the published 64-pixel sets are cut short: {folder} has {len(files)} episodes{expert}, the 84-pixel one "
+            f"all: `vd4rl-pomdp data download --task {task} --quality {quality}`, then `data import vd4rl SET OUT "
+            "--size 64`"
+        ]
     record = {"folder": folder.resolve().name, "bytes": sum(file.stat().st_size for file in files)}
-    return SourceSet(
-        len(files),
-        rows,
-        frame_shape,
-        lambda first: map(_episode, files[first:]),
-        record,
-        task=task,
-        quality=quality,
-        notes=_cut_short(folder, len(files), task, quality),
-    )
-
-
-def _cut_short(folder: Path, episodes: int, task: str | None, quality: str | None) -> list[str]:
-    """Warn if a 64-pixel data set has fewer episodes than V-D4RL's paper states, as those on its mirror do."""
-    if "64px" not in folder.resolve().parts or episodes > 100 or None in (task, quality):
-        return []
-    expert = " of the expert alone" if quality == "medium_expert" else ""
-    return [
-        f"the published 64-pixel sets are cut short: {folder} has {episodes} episodes{expert}, the 84-pixel one all: "
-        f"`vd4rl-pomdp data download --task {task} --quality {quality}`, then `data import vd4rl SET OUT --size 64`"
-    ]
+    read = lambda first: map(_episode, files[first:])  # noqa: E731
+    return SourceSet(len(files), rows, frame_shape, read, record, task=task, quality=quality, notes=notes)
 
 
 def _episode(path: Path) -> EpisodeArrays:
-    """Read the rows of one file."""
     try:
         with np.load(path) as file:
             stored = {key: file[key] for key in file.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
         raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); fetch it again") from error
-    if lacking := [key for key in ("image", "action", "reward") if key not in stored]:
-        raise UserError(f"{path}: has no {lacking[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
+    if missing := [key for key in ("image", "action", "reward") if key not in stored]:
+        raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
     rows = len(stored["reward"])
     for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
         if (count := len(stored.get(key, stored["reward"]))) != rows:
