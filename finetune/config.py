@@ -20,7 +20,7 @@ from vd4rl_pomdp.runs.metrics import WandbMode
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneConfig(StageConfig):
-    """Settings of `vd4rl-pomdp finetune`. The flags depend on --algorithm: put it before --help."""
+    """Train a policy on a frozen encoder. Some flags depend on --algorithm: put it before --help."""
 
     encoder: Path = Path()
     """Encoder folder, `RUN/encoder` of a pretraining run. The encoder stays frozen, except with bc and drq_bc, which

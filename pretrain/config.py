@@ -36,7 +36,7 @@ class TrainingConfig(StageConfig):
     """Settings shared by everything that trains an objective."""
 
     data: Path = Path()
-    """Data set folder."""
+    """Dataset folder."""
     out: Path = Path()
     """Run folder; re-run the same command to resume."""
     method: str = "mik+a"
@@ -90,7 +90,7 @@ class PretrainConfig(TrainingConfig):
     --history: put these before --help to see the flags of your choice."""
 
     task: str = ""
-    """Task of the data set; needed only if neither its shards nor its folder name state it."""
+    """Task of the dataset; needed only if neither its shards nor its folder name state it."""
     shift: int = 4
     """Largest random shift in pixels; the method decides whether a window or each observation is shifted as one."""
     history: str = "method"

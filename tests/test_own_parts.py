@@ -139,6 +139,7 @@ def registries():
             for kind in EXAMPLES
             if kind not in ("corruption", "history")
         ),
+        ("method", int, r"derived from vd4rl_pomdp\.options\.Options"),
         ("frame_encoder", Options, "name a dataclass that is derived from .*frame.FrameOptions"),
     ],
 )

@@ -251,7 +251,7 @@ def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
         missing = "; ".join(f"{key.quality}, `{key.method}`{words}" for key, words in hidden.items())
         told += " so far" * bool(mine and missing)
         rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", told, missing or "all are there"))
-    head = ("task", "units", "cells that count, of those asked for", "updates by the rule", "not run yet")
+    head = ("task", "units", "cells that count, of those required", "updates by the rule", "not run yet")
     return table_lines(head, rows, (0, 4))
 
 

@@ -182,7 +182,7 @@ def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
         shares += [f"{number(row['acro_bar'], 2)} ({row['bar_from']})", number(row["best_share"], 2)]
         above = with_interval(row["above_random"], row["low"], row["high"], 0)
         rows.append((row["name"], f"{row['data_return']:.0f}", *shares, above, row["passed"]))
-    shares = ("`state`, of it", "`acro` with nothing hidden, of it", "its bar (published score)", "best of it")
+    shares = ("`state` / data", "`acro` with nothing hidden / data", "its bar (published score)", "best / data")
     return table_lines(("set", "data's return", *shares, "best less `random`", "passed"), rows, (0, 7))
 
 

@@ -69,7 +69,7 @@ _OWN = {
         "gru",
         use_actions=True,
         options=InverseOptions,
-        summary="ah whose pasts hold actions, the predicted one among them",
+        summary="ah with past actions, the predicted one among them",
     ),
     "fj": Method(
         ForwardJump, "gru", past=8, options=InverseOptions, summary="inverse model on t, t+k and the m rows before each"
@@ -80,13 +80,13 @@ _OWN = {
         use_actions=True,
         past=8,
         options=InverseOptions,
-        summary="fj whose windows hold actions",
+        summary="fj with the actions of its windows",
     ),
     "mik": Method(
         MaskedInverse,
         "gru",
         options=MaskedOptions,
-        summary="inverse model on the past at t and the future from t+k on; between them is masked",
+        summary="inverse model on the past at t and the future from t+k on, the steps between masked",
     ),
     "mik+a": Method(
         MaskedInverse,
@@ -105,26 +105,30 @@ _OWN = {
         ACDF, options=ACDFOptions, summary="memoryless multi-step inverse model with a latent forward model"
     ),
     "smwm": Method(
-        SMWM, options=SMWMOptions, summary="one-step inverse model with a latent forward model that moves both its ends"
+        SMWM,
+        options=SMWMOptions,
+        summary="one-step inverse model with a latent forward model, whose gradients reach both states",
     ),
     "curl": Method(
-        CURL, shift="own", least_batch=2, summary="contrastive: two augmentations of one observation find each other"
+        CURL, shift="own", least_batch=2, summary="contrastive: matches two augmentations of one observation"
     ),
     "driml": Method(
         DRIML,
         least_batch=2,
         shift="observation",
         options=DRIMLOptions,
-        summary="contrastive: (s_t, a_t) finds s_{t+k}, globally and by place",
+        summary="contrastive: matches (s_t, a_t) with s_{t+k}, on global and local features",
     ),
-    "homer": Method(HOMER, shift="observation", options=HOMEROptions, summary="tells real transitions from imposters"),
-    "random": Method(Untrained, trained=False, summary="no training: the floor"),
+    "homer": Method(
+        HOMER, shift="observation", options=HOMEROptions, summary="contrastive: classifies transitions as real or fake"
+    ),
+    "random": Method(Untrained, trained=False, summary="an untrained encoder, as a baseline"),
     "supervised": Method(
         Supervised,
         "gru",
         regresses_state=True,
         options=SupervisedOptions,
-        summary="mik's encoder, trained to regress the simulator's state: a reference for memory",
+        summary="mik's encoder, regressing the simulator's state: a privileged reference with memory",
     ),
     "supervised+a": Method(
         Supervised,
@@ -132,13 +136,13 @@ _OWN = {
         use_actions=True,
         regresses_state=True,
         options=SupervisedOptions,
-        summary="supervised whose past holds actions, as mik+a's does",
+        summary="supervised with past actions, as in mik+a",
     ),
     "supervised_picture": Method(
         Supervised,
         regresses_state=True,
         options=SupervisedOptions,
-        summary="supervised without a memory: a reference for what one observation tells",
+        summary="supervised on single observations: a privileged reference without memory",
     ),
     "integrator": Method(
         Supervised,
@@ -147,18 +151,16 @@ _OWN = {
         regresses_state=True,
         histories=True,
         options=SupervisedOptions,
-        summary="supervised on the first observation, the actions since and the time: a floor for memory",
+        summary="supervised on the first observation, later actions and the time alone",
     ),
-    "bc": Method(Untrained, trained=False, end_to_end="bc", summary="end to end by behaviour cloning, no frozen stage"),
-    "drq_bc": Method(
-        Untrained, trained=False, end_to_end="drqv2_bc", summary="end to end by DrQ-v2+BC, no frozen stage"
-    ),
+    "bc": Method(Untrained, trained=False, end_to_end="bc", summary="behaviour cloning from pixels, end to end"),
+    "drq_bc": Method(Untrained, trained=False, end_to_end="drqv2_bc", summary="DrQ-v2+BC from pixels, end to end"),
     "state": Method(
         Untrained,
         trained=False,
         reads_state=True,
         options=StateOptions,
-        summary="the simulator's state in place of an encoder: a reference",
+        summary="the simulator's state instead of an encoder: a privileged reference",
     ),
 }
 METHODS: Registry[Method] = Registry(

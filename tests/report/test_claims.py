@@ -8,7 +8,7 @@ import scipy.stats
 
 from tests.helpers_report import describe, write_run, write_seeds
 from vd4rl_pomdp.report import print_summary, write_report
-from vd4rl_pomdp.report.gates import CLAIMS, judge_claims
+from vd4rl_pomdp.report.gates import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -41,13 +41,13 @@ def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
     shown = {claim: (round(row["left_return"]), round(row["right_return"])) for claim, row in rows.items()}
     assert shown == {
         "acro returns less where pixels are hidden": (610, 210),
-        "a memory pays: mik above acro": (320, 210),
-        "past actions pay: mik+a above mik": (520, 320),
-        "both pay: mik+a above acro": (520, 210),
+        "memory helps: mik above acro": (320, 210),
+        "past actions help: mik+a above mik": (520, 320),
+        "both help: mik+a above acro": (520, 210),
         "mik+a is above every other method": (520, 320),
         "with nothing hidden, mik+a is not below acro": (590, 610),
-        "what is left to a memory that was told the states": (705, 520),
-        "what is left to the states themselves": (760, 520),
+        "what a memory trained on the states adds": (705, 520),
+        "what the states themselves add": (760, 520),
     }
     assert rows[ACTIONS]["difference"] == pytest.approx(200)
     found = scipy.stats.ttest_ind([500, 540], [310, 330], equal_var=False).confidence_interval(0.95)
@@ -178,12 +178,12 @@ def test_runs_of_like_settings_are_compared_and_not_the_best_of_each_side(tmp_pa
 def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, settings, words):
     write(tmp_path, GOOD | {("mik+a", "patch"): (), ("mik+a", "none"): ()})
     rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, **settings))
-    for claim in (ACTIONS, FIRST, "what is left to a memory that was told the states"):
+    for claim in (ACTIONS, FIRST, "what a memory trained on the states adds"):
         row = rows[claim]
         assert (row["verdict"], row["difference"], row["low"]) == (f"not judged: other {words}", None, None)
         assert 910 in (round(row["left_return"]), round(row["right_return"])), "both sides are shown"
     assert rows[MEMORY]["verdict"] == "holds"
-    states = rows["what is left to the states themselves"]
+    states = rows["what the states themselves add"]
     assert (states["verdict"], states["difference"]) == ("", pytest.approx(760 - 910)), "states are not pretrained"
 
 
@@ -233,3 +233,9 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, "one seed of mik is higher"
     assert f"{ACTIONS} (primary): holds in 0 of 1 setting; too few seeds in 1" in shown
     assert "told the states" not in shown
+
+
+def test_the_tally_counts_unjudged_settings_once_and_by_reason():
+    verdicts = ["not judged: other data", "undecided", "holds", "not judged: other data", "not judged: other readout"]
+    rows = [{"kind": "above", "verdict": verdict} for verdict in verdicts]
+    assert tally(rows) == "holds in 1 of 5 settings; undecided in 1; not judged in 3 (2 other data, 1 other readout)"

@@ -314,7 +314,11 @@ def test_figures_show_returns_below_zero_best_evaluations_and_gaps(tmp_path, mon
     write_report([tmp_path / "runs"], tmp_path / "out")
     (scores,) = plots["scores_patch"].figure.axes
     assert scores.get_title() == "walker_walk expert (data score 51.2)"
-    assert [text.get_text() for text in scores.get_yticklabels()] == ["mik+a (×1)", "acro (×1)", "bc (×2)"]
+    assert [text.get_text() for text in scores.get_yticklabels()] == [
+        "mik+a (1 missing)",
+        "acro (1 missing)",
+        "bc (2 missing)",
+    ]
     low, high = scores.get_xlim()
     assert low < -60 < 0 <= high
     offsets = [points for dots in scores.collections for points in dots.get_offsets().tolist()]

@@ -60,9 +60,16 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     (told,) = json.loads((out / "certificates.json").read_text()).values()
     assert told["name"] == "patch, patch_size 24"
     assert told["why"].startswith("R2: supervised+a -")
-    assert told["why"].endswith(", too few seeds, too little itself to tell; no returns")
+    assert told["why"].endswith(", too few seeds, itself too low to judge; no returns")
     assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
     assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
+    (states / "certificates.json").unlink()
+    (states / "certificates.json").mkdir()  # nor can it be written to a dataset that is read-only
+    main(words)
+    shown = capsys.readouterr()
+    assert f"patch: {told['verdict']} ({told['why']})" in shown.out
+    assert f"the certificate is in {out} alone" in shown.err
+    (states / "certificates.json").rmdir()
 
     before, carried[:] = contents(out / MEMORY), []
     main([*words, *POLICIES.split(), "--returns"])

@@ -23,7 +23,7 @@ def collect(words: list[str], program: str) -> None:
 
     config = parse(CollectConfig, words, program)
     shards = collect(config)
-    print(f"{len(shards)} shards in {config.out}, described in {config.out / 'card.md'}")
+    print(f"shards in {config.out}: {len(shards)}, described in {config.out / 'card.md'}")
     print(f"check them with `{program_name()} data check {shlex.quote(str(config.out))}`")
 
 
@@ -52,7 +52,7 @@ def download(
         shards = download(one, level, out, endpoint, verify)
         folder = shards[0].parent
         check = f"{program_name()} data check {shlex.quote(str(folder))}"
-        print(f"{len(shards)} shards in {folder}; check them with `{check}`")
+        print(f"shards in {folder}: {len(shards)}; check them with `{check}`")
 
 
 @command
@@ -72,7 +72,7 @@ def import_set(
         format: Name of the format, as in `vd4rl-pomdp list`.
         source: Path or name of the dataset.
         out: Folder of the new dataset.
-        task: Its task, if the source does not name one; a dataset of an unregistered task can only train encoders.
+        task: Its task, if the source does not name one; an unregistered one needs `finetune --eval-episodes 0`.
         quality: Name of the behaviour that made the data.
         size: Height and width to resize images to, by area; default: no resizing.
         picture: Observation key of the images, if there are several.
@@ -81,7 +81,7 @@ def import_set(
     from vd4rl_pomdp.data.transfer import import_set
 
     shards = import_set(format, source, out, task, quality, size, picture, clip_actions)
-    print(f"{len(shards)} shards in {out}, described in {out / 'card.md'}")
+    print(f"shards in {out}: {len(shards)}, described in {out / 'card.md'}")
 
 
 @command

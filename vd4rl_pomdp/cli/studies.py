@@ -212,7 +212,7 @@ def navigation_collect(words: list[str], program: str) -> None:
     from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
 
     config = parse_stage(MazeCollectConfig, words, program)
-    print(f"{len(collect(config))} shards in {config.out}")
+    print(f"shards in {config.out}: {len(collect(config))}")
 
 
 def navigation_train(words: list[str], program: str) -> None:

@@ -214,7 +214,7 @@ def join(
     threads: int = 0,
     stack: int = 1,
 ) -> None:
-    """Help with a sweep on this machine: run jobs that nobody else runs, and exit when there are none left.
+    """Work on a running sweep from this machine: run jobs that no other driver runs, and exit when none are left.
 
     Slurm and Ray tasks do this; on any other cluster, start as many as you like.
 

@@ -196,7 +196,6 @@ def words_of(settings: Mapping[str, Any]) -> list[str]:
 def refuse_options(kind: Any, base: type[Options] = Options) -> None:
     """Raise UserError unless `kind`, what a plug-in gives as its options class, is a valid subclass of `base`."""
     if not (isinstance(kind, type) and issubclass(kind, base)):
-        raise UserError(
-            f"its options are {kind!r}: name a dataclass that is derived from {base.__module__}.{base.__name__}"
-        )
+        public = base.__module__.replace("vd4rl_pomdp.core.", "vd4rl_pomdp.")
+        raise UserError(f"its options are {kind!r}: name a dataclass that is derived from {public}.{base.__name__}")
     flat(kind.fill({}))

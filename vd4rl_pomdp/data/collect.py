@@ -46,7 +46,7 @@ MAX_NOISE = 2.0
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Collect a data set."""
+    """Collect a dataset with the shipped actors."""
 
     task: str
     """walker_walk, cheetah_run, humanoid_walk, reacher_jump, point_mass_cue, or a task that you registered."""
@@ -54,9 +54,9 @@ class CollectConfig:
     """Behaviour policy: random actions, checkpoints on the way to the medium actor, the medium actor, half medium and
     half expert, or the expert actor. The noisy qualities (not in V-D4RL) add the task's noise to every action."""
     out: Path
-    """Folder to write the data set to."""
+    """Folder to write the dataset to."""
     episodes: int = 200
-    """Number of episodes, of 501 rows each in the benchmark's tasks (V-D4RL's data sets have 200)."""
+    """Number of episodes, of 501 rows each in the benchmark's tasks (V-D4RL's datasets have 200)."""
     seed: int = 0
     """Seed of initial states and actions."""
     workers: int = 0
@@ -66,12 +66,12 @@ class CollectConfig:
     frame_size: int = FRAME_SIZE
     """Height and width of the frames in pixels."""
     episodes_per_shard: int = 50
-    """Episodes per shard."""
+    """Episodes per shard. An interrupted collection keeps its finished shards."""
     actor: Path | None = None
     """An actor file to use instead of the shipped one (for medium or expert)."""
     action_noise: float | None = None
-    """Standard deviation of Gaussian noise added to every action, both executed and stored; it becomes part of the data
-    set's name. Default: none, or the task's noise for the noisy qualities."""
+    """Standard deviation of Gaussian noise added to every action, both executed and stored; it becomes part of the
+    dataset's name. Default: none, or the task's noise for the noisy qualities."""
 
 
 @dataclass(frozen=True)

@@ -189,17 +189,17 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
         ),
         "nature_half": FrameEncoderPart(
             _convolutions((32, 4, 2), (64, 4, 2), (64, 3, 1), half=True),
-            summary="nature on pictures of half the resolution",
+            summary="nature at half the resolution",
         ),
         "small": FrameEncoderPart(
             _convolutions((16, 5, 2), (32, 3, 2), (32, 3, 2)),
-            summary="three strided convolutions of few channels, for grey 50x50 pictures",
+            summary="three strided convolutions of few channels, for grey 50x50 images",
         ),
-        "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels: the paper's on mazes"),
+        "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels, as in the paper's mazes"),
         "pretrained": FrameEncoderPart(
             lambda channels, size, options: Pretrained(options.model, options.model_size, options.weights, channels),
             PretrainedOptions,
-            "a frozen image model that transformers knows by name, DINOv2 by default",
+            "a frozen image model from Hugging Face transformers, DINOv2 by default",
         ),
         "flat": FrameEncoderPart(_convolutions(), summary="no convolution, for observations of a few numbers"),
     },

@@ -41,11 +41,11 @@ def _refuse_part(name: str, part: MemoryPart) -> None:
 MEMORIES: Registry[MemoryPart] = Registry(
     "memory",
     {
-        "gru": MemoryPart(GRU, GRUOptions, summary="gated recurrent units, in the paper's methods"),
+        "gru": MemoryPart(GRU, GRUOptions, summary="gated recurrent units, as in the paper"),
         "transformer": MemoryPart(Transformer, TransformerOptions, summary="causal attention to a window of rows"),
-        "lru": MemoryPart(LRU, LRUOptions, summary="linear recurrent units, in parallel over a window"),
+        "lru": MemoryPart(LRU, LRUOptions, summary="linear recurrent units, computed in parallel over a window"),
         "integrator": MemoryPart(
-            Integrator, GRUOptions, summary="a floor: a GRU of the first observation, the actions since, and the time"
+            Integrator, GRUOptions, summary="a GRU on the first observation, later actions and the time alone"
         ),
     },
     lambda part: isinstance(part, MemoryPart),

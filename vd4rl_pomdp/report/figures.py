@@ -210,7 +210,7 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
             axes.scatter(mine, place + spread, 7, color=colour, ec="black", lw=0.4, zorder=4)
             if row["best_score"] > row["score"]:
                 axes.scatter(row["best_score"], place, 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
-            names.append(plain(row["label"] + (f" (×{row['absent']})" if row["absent"] else ""), NAME_WIDTH))
+            names.append(plain(row["label"] + (f" ({row['absent']} missing)" if row["absent"] else ""), NAME_WIDTH))
         axes.set_yticks(range(len(rows)), names, fontsize=7)
         axes.set_ylim(max(len(rows), 4) - 0.4, -0.6)
         axes.grid(axis="y", visible=False)
@@ -225,8 +225,8 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
 
     caption = (
         "Final scores under {}. Bars: mean over seeds at the last evaluation; lines: 95% t intervals over seeds and "
-        "episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; ×2: two "
-        "seeds are missing, unfinished or diverged."
+        "episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; missing: "
+        "seeds without a finished run."
     )
     scored = summary[summary["score"].notna()]
     return _plots(
@@ -298,7 +298,7 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "threshold", "share", marker=None, where="post")
-        axes.set(xlabel="score", ylabel="share of runs above it", ylim=(0, 1.02))
+        axes.set(xlabel="score", ylabel="share of runs above the score", ylim=(0, 1.02))
         axes.set_xlim(rows["threshold"].min(), rows["threshold"].max())
 
     shown = profiles.assign(label=profiles["method"])
@@ -349,12 +349,12 @@ def lead_plots(leads: pd.DataFrame) -> list[Plot]:
 DOTS = {
     "probes": (
         dict(zip(PROBES, ("pose", "velocity"), strict=True)),
-        "error, %",
+        "probe error, % of s.d.",
         "the error of a linear probe of pose and of velocity, in percent of a standard deviation",
     ),
     "errors": (
-        dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
-        "mean squared error",
+        dict(zip(ACTION_ERRORS, ("on the data", "in closed loop"), strict=True)),
+        "action error (MSE)",
         "the mean squared difference of its actions from the data's actor's, on the data and in closed loop",
     ),
 }

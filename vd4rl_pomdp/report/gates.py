@@ -42,6 +42,7 @@ NOT_RECORDED = "convergence is not recorded"
 GATED = (*SETTING, "algorithm")
 _place = itemgetter(*GATED)
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
+UNJUDGED = "not judged: "  # how a verdict begins where nothing is judged, before the reason
 NOT_REFUTED = "not refuted"  # verdict of an undecided "not below" claim
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
 DISTANCE = "distance"  # kind of a row that is a measurement, not a claim
@@ -282,16 +283,16 @@ class ReturnClaim(NamedTuple):
 _MIK_A, _MIK, _ACRO = Contender("mik+a"), Contender("mik"), Contender("acro")
 CLAIMS = (
     ReturnClaim("acro returns less where pixels are hidden", Contender("acro", clean=True), _ACRO),
-    ReturnClaim("a memory pays: mik above acro", _MIK, _ACRO, family=PRIMARY),
-    ReturnClaim("a memory pays: acro with a GRU above acro", Contender("acro", "gru"), _ACRO, family=PRIMARY),
-    ReturnClaim("past actions pay: mik+a above mik", _MIK_A, _MIK, family=PRIMARY),
-    ReturnClaim("both pay: mik+a above acro", _MIK_A, _ACRO, family=PRIMARY),
+    ReturnClaim("memory helps: mik above acro", _MIK, _ACRO, family=PRIMARY),
+    ReturnClaim("memory helps: acro with a GRU above acro", Contender("acro", "gru"), _ACRO, family=PRIMARY),
+    ReturnClaim("past actions help: mik+a above mik", _MIK_A, _MIK, family=PRIMARY),
+    ReturnClaim("both help: mik+a above acro", _MIK_A, _ACRO, family=PRIMARY),
     ReturnClaim("mik+a above ah+a", _MIK_A, Contender("ah+a"), family=SECOND),
     ReturnClaim("mik+a above fj+a", _MIK_A, Contender("fj+a"), family=SECOND),
     ReturnClaim("mik+a is above every other method", _MIK_A, Contender()),
     ReturnClaim("with nothing hidden, mik+a is not below acro", _MIK_A, _ACRO, hidden=False, kind="not below"),
-    ReturnClaim("what is left to a memory that was told the states", Contender("supervised+a"), _MIK_A, kind=DISTANCE),
-    ReturnClaim("what is left to the states themselves", Contender("state", clean=True), _MIK_A, kind=DISTANCE),
+    ReturnClaim("what a memory trained on the states adds", Contender("supervised+a"), _MIK_A, kind=DISTANCE),
+    ReturnClaim("what the states themselves add", Contender("state", clean=True), _MIK_A, kind=DISTANCE),
 )
 
 
@@ -363,12 +364,12 @@ def _decisive(left: list[Run], others: list[Run]) -> Sides:
 
 def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
     if compared.unlike:
-        return f"not judged: other {', '.join(compared.unlike)}"
+        return f"{UNJUDGED}other {', '.join(compared.unlike)}"
     if row["kind"] == DISTANCE:
         return ""
     settled = converged([*compared.left, *compared.right])
     if unranked or not settled:
-        return f"not judged: {NOT_RECORDED if settled is None and not unranked else FAILED}"
+        return f"{UNJUDGED}{NOT_RECORDED if settled is None and not unranked else FAILED}"
     p = row["p"] if row["adjusted_p"] is None else row["adjusted_p"]
     sign = HOLDS if row["difference"] > 0 else FAILS
     found = FEW if p is None else sign if p < stats.LEVEL else OPEN
@@ -376,12 +377,17 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
 
 
 def tally(rows: list[Row]) -> str:
-    """Summary of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
+    """Summary of a claim over its settings: "holds in 1 of 3 settings; undecided in 1; not judged in 1 (1 REASON)"."""
     if rows[0]["kind"] == DISTANCE:
         return ""
     counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
-    held = f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"
-    return "; ".join([held, *(f"{verdict} in {count}" for verdict, count in counts.items())])
+    words = [f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"]
+    reasons = {name.removeprefix(UNJUDGED): counts.pop(name) for name in [*counts] if name.startswith(UNJUDGED)}
+    words += [f"{verdict} in {count}" for verdict, count in counts.items()]
+    if reasons:
+        why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        words.append(f"not judged in {sum(reasons.values())} ({why})")
+    return "; ".join(words)
 
 
 def leads(runs: list[Run]) -> list[Row]:

@@ -81,7 +81,7 @@ SHOWN: dict[str, Columns] = {
         "data's return": ("data_return", 0),
         "state": ("state_share", 2),
         "acro, none": ("acro_share", 2),
-        "its bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
+        "acro's bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
         "best": ("best_share", 2),
         "best – random": ("above_random", "low", "high", 0),
     },
@@ -92,8 +92,8 @@ SHOWN: dict[str, Columns] = {
         "left": lambda row: f"{row['left']}: {row['left_return']:.0f} (n = {row['left_seeds']})",
         "right": lambda row: f"{row['right']}: {row['right_return']:.0f} (n = {row['right_seeds']})",
         "difference": ("difference", "low", "high", 0),
-        "p (Holm)": lambda row: _two(row["p"], row["adjusted_p"], 3),
-        "would be found": lambda row: _two(
+        "p (Holm)": lambda row: _two(row["p"], row["adjusted_p"], 3).replace("0.000", "< 0.001"),
+        "detectable difference": lambda row: _two(
             row["smallest"], row["smallest_share"] and 100 * row["smallest_share"], 0, "%"
         ),
         "played clean": ("clean_difference", "clean_low", "clean_high", 0),
@@ -114,7 +114,7 @@ SHOWN: dict[str, Columns] = {
         "its update": ("best_step", 0),
         "seeds": _count,
         "episodes": "episodes",
-        "not there": "missing",
+        "no result": "missing",
     },
     "aggregate": {
         "corruption": "corruption",
@@ -135,7 +135,7 @@ SHOWN: dict[str, Columns] = {
         "velocity, %": (PROBES[1], 1),
         "return": ("return", 0),
         "seeds": ("seeds", 0),
-        "not there": "missing",
+        "no result": "missing",
     },
     "control": {
         "setting": setting,
@@ -228,8 +228,8 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame) -> Iterator[Bloc
                 note += " --hold-out."
             if name == MARK:
                 note += f" Memory: {mine['memory'].iloc[0]}."
-            if "not there" in shown and not shown["not there"].any():
-                shown = shown.drop(columns="not there")
+            if "no result" in shown and not shown["no result"].any():
+                shown = shown.drop(columns="no result")
             yield block(str(heading), shown, words, note)
 
 
@@ -414,6 +414,6 @@ def print_summary(report: Report, console: Console | None = None) -> None:
         console.print(line, markup=False, highlight=False)
     shown = texts(report.summary, SHOWN[MARK])
     for place, part in shown.groupby("setting", sort=False):
-        missing = ["not there"] if part["not there"].any() else []
+        missing = ["no result"] if part["no result"].any() else []
         console.print(f"memory: {report.summary.loc[part.index[0], 'memory']}", markup=False, highlight=False)
         console.print(terminal(str(place), part[["method", "last evaluation", "seeds", "episodes", *missing]]))

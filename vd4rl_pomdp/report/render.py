@@ -76,7 +76,7 @@ def terminal(title: str, table: pd.DataFrame) -> Table:
     """A table of text for the terminal. The first column and the gaps wrap; numbers do not."""
     shown = Table(title=Text(title), title_justify="left")
     for name in table.columns:
-        words = name in (table.columns[0], "not there")
+        words = name in (table.columns[0], "no result")
         shown.add_column(name, overflow="fold", justify="left" if words else "right", no_wrap=not words)
     for row in table.itertuples(index=False):
         shown.add_row(*map(Text, row))

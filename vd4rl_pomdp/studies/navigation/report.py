@@ -341,7 +341,7 @@ def verdict_lines(frame: pd.DataFrame) -> list[str]:
         *lines,
         *table_lines(head, rows, range(len(head))),
         "",
-        "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
+        "That ah+a beats the untrained encoder is not to be expected: it reads an action from its record of past ones",
         f"and need not keep the state. In the paper its position error is {recorder}.",
         "",
     ]

@@ -133,12 +133,12 @@ def facts() -> list[Row]:
             [_prediction(world, "mik+a", 1) for world in (tiny("hidden switch"), theirs)],
         ),
         (
-            "On the counterexample k = 3 tells nothing",
-            "k = 2 and k = 3 are needed to tell the states apart, and k > 3 is uniform (section 3.2)",
-            [(theirs.name, "pairs at which k = 3 tells something", "some", informative)],
+            "On the counterexample k = 3 is uninformative",
+            "k = 2 and k = 3 are needed to separate the states, and k > 3 is uniform (section 3.2)",
+            [(theirs.name, "pairs at which k = 3 is informative", "some", informative)],
         ),
         (
-            "With the main text's actions 0 and 1 every k tells something",
+            "With the main text's actions 0 and 1 every k is informative",
             "a_t is 0 or 1, the diameter is 3, and k > 3 is uniform (section 3.2); the appendix has -1 and +1",
             [
                 (main.name, "k above 3 that are uniform", "4 to 10", even or "none"),
@@ -146,7 +146,7 @@ def facts() -> list[Row]:
             ],
         ),
         (
-            "Read literally, the later view holds the action that is asked for",
+            "Read literally, the later view contains the action to be predicted",
             f"row t is (o_t, a_{{t-1}}) (section 2), the later view begins with row t+k (appendix), MIK+A is {INVERSE} "
             "from k = 1 on (section 3.1)",
             [_prediction(tiny("idle"), "mik+a literal", 1)],
@@ -162,7 +162,7 @@ def facts() -> list[Row]:
             [_merged(world) for world in (tiny("switch"), echo())],
         ),
         (
-            "Where states take turns, no inverse model tells the turns apart",
+            "Where states take turns, no inverse model distinguishes the turns",
             "all k up to the diameter recover the state of a deterministic world (appendix), and k = 1 to 3 that of "
             "the counterexample (section 3.2)",
             [_codes(world) for world in (tiny("alternator"), theirs)],
@@ -381,7 +381,7 @@ def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]
         for row in (row for row in table if row["decodes_past"] and row["decodes_end"]):
             computed = {
                 "correct": f"wrong at k = {', '.join(map(str, row['wrong_k']))}",
-                "complete": f"{row['forced']} of {row['pairs']} pairs of states are always told apart",
+                "complete": f"{row['forced']} of {row['pairs']} pairs of states are always separated",
                 "discards": "the past's code must carry part of the exogenous state",
             }
             told = PRINTED[row["method"].removesuffix(" literal")]  # literal readings share it
