@@ -60,7 +60,7 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     (told,) = json.loads((out / "certificates.json").read_text()).values()
     assert told["name"] == "patch, patch_size 24"
     assert told["why"].startswith("R2: supervised+a -")
-    assert told["why"].endswith(", too few seeds, itself too low to judge; no returns")
+    assert told["why"].endswith(", too few seeds, itself too low to judge; 1 steps, no returns")
     assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
     assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
     (states / "certificates.json").unlink()
@@ -81,6 +81,9 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     assert "returns: state returns " in told["why"]
     assert "critics are not known to have converged" in told["why"]
     assert told["measured"]["returns"]["verdict"] == OPEN
+    assert told["why"].endswith("; 1 steps, 5 updates")
+    main([*words[:4], str(tmp_path / "again"), *words[5:]])  # of a smaller budget, without policies
+    assert json.loads((states / "certificates.json").read_text()).popitem()[1] == told
 
     main(["data", "card", str(states)])
     assert f"| memory under patch, patch_size 24 | {told['verdict']} (" in (states / "card.md").read_text()
@@ -111,7 +114,7 @@ def test_where_there_is_none_for_the_very_set_and_corruption_it_says_so(tmp_path
     main(report)
     assert "memory: not certified\n" in capsys.readouterr().out
     assert not (tmp_path / "report" / "certificates.json").exists()
-    for year in ("2027", "2026"):  # of two for one set and corruption the newest counts
+    for year in ("2027", "2026"):  # of two with one budget the newest counts
         (tmp_path / "runs" / year).mkdir()
         told = certificate | {"made": year, "why": f"in {year}"}
         keep_certificates(tmp_path / "runs" / year, {certificate_id("f00", hidden): told})

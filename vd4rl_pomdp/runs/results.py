@@ -334,10 +334,16 @@ def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
     return content_hash([data, dict(corruption)])
 
 
-def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
-    """All certificates at or below some folders, by id; the newest of duplicates. The own file of `but` is skipped.
+def _rank(certificate: Row) -> tuple[int, int, str]:
+    """Of several certificates the one of the largest budget counts, then the newest."""
+    budget = certificate.get("budget", {})
+    return budget.get("updates", 0), budget.get("steps", 0), str(certificate["made"])
 
-    UserError if a file is damaged.
+
+def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+    """All certificates at or below some folders, by id; of duplicates that of the largest budget, then the newest.
+
+    The own file of `but` is skipped. UserError if a file is damaged.
     """
     found: dict[str, Row] = {}
     for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
@@ -345,17 +351,17 @@ def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[s
         for name, one in told.items():
             if not (isinstance(one, dict) and one.keys() >= _HOLDS):
                 raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
-            if name not in found or str(one["made"]) > str(found[name]["made"]):
-                found[name] = one
+            found[name] = max(found.get(name, one), one, key=_rank)
     return found
 
 
 def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
-    """Add certificates to a folder's file, replacing those with the same id. Writes nothing if nothing changes."""
+    """Add certificates to a folder's file, replacing those with the same id and no larger budget."""
     file = folder / CERTIFICATES
     there = read_json(file) if file.exists() else {}
-    if there | certificates != there:
-        write_json(file, there | certificates)
+    merged = there | {name: max(there.get(name, one), one, key=_rank) for name, one in certificates.items()}
+    if merged != there:
+        write_json(file, merged)
 
 
 def certificate_in_words(certificate: Row) -> str:

@@ -112,12 +112,19 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     hidden, usual = record.pretrain.corruption, flat(CorruptionConfig.of(record.pretrain.corruption["corruption"]))
     options = (f"{name} {value}" for name, value in hidden.items() if usual.get(name) != value)
     verdicts = {row["verdict"] for row in measured.values()}
+    budget = {"steps": record.pretrain.steps, "updates": measured.get("returns", {}).get("updates", 0)}
     certificate = {
         "data": dataset.fingerprint,
         **{"task": dataset.task, "quality": dataset.quality, "corruption": hidden},
         "name": ", ".join([hidden["corruption"], *options]),
         "verdict": verdicts.pop() if len(verdicts) == 1 else OPEN,
-        "why": "; ".join(f"{kind}: {row['why']}" for kind, row in measured.items()) + "; no returns" * (not returns),
+        "why": "; ".join(
+            [
+                *(f"{kind}: {row['why']}" for kind, row in measured.items()),
+                f"{budget['steps']:,} steps, " + (f"{budget['updates']:,} updates" if returns else "no returns"),
+            ]
+        ),
+        "budget": budget,
         "measured": measured,
         "seeds": sorted({cell.seed for cell in cells}),
         **{"version": __version__, "commit": git_commit(), "made": datetime.now(UTC).isoformat(timespec="seconds")},
@@ -159,6 +166,7 @@ def _returns(folders: Sequence[Path]) -> Row:
     row = judge({name: found[name] for name in (MEMORY, *FLOORS)}, float(data), 0)
     share = float(found[STATE].mean() / data)
     row |= {"data_return": float(data), "state_share": share, "converged": converged(runs)}
+    row["updates"] = min(run.result.record["config"]["updates"] for run in runs)
     missed = []
     if not share >= STATE_SHARE:
         missed.append(f"state returns {share:.2f} of the data's return, less than {STATE_SHARE}")
