@@ -1,9 +1,8 @@
 """State-based SAC actors as small safetensors files with numpy inference; no deep learning library needed.
 
 An actor maps dm_control's flattened observations to a tanh-squashed Gaussian over actions (Haarnoja et al. 2018,
-arXiv 1801.01290), by a ReLU MLP or SimBa's residual blocks (Lee et al. 2024, arXiv 2410.09754), optionally after
-standardising the observations. Weights are float32; actions are computed in float64 and rounded to float32 once, so
-that they do not depend on the processor.
+arXiv 1801.01290), by a ReLU MLP, optionally after standardising the observations. Weights are float32; actions are
+computed in float64 and rounded to float32 once, so that they do not depend on the processor.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from vd4rl_pomdp.runs.files import write_bytes
 LOG_STD_RANGE = (-20.0, 2.0)
 OBSERVATION_CLIP = 10.0
 """Standardised observations are clipped to +-10."""
-LAYER_NORM_EPSILON = 1e-6
 ASSETS = Path(__file__).parent / "assets"
 _REMEDY = "take another copy"
 
@@ -39,9 +37,8 @@ class Actor:
     """A stochastic policy on simulator states."""
 
     weights: dict[str, np.ndarray]
-    """float32 matrices (in, out), each with a `.bias`: `mean.weight`, `log_std.weight`, and either `hidden.{i}.weight`
-    (MLP) or `embed.weight`, `block.{i}.up.weight` and `block.{i}.down.weight` with layer norms `block.{i}.norm.scale`
-    and `norm.scale` (SimBa); optionally `observation.mean` and `observation.std` (D,)."""
+    """float32 matrices (in, out), each with a `.bias`: `hidden.{i}.weight`, `mean.weight` and `log_std.weight`;
+    optionally `observation.mean` and `observation.std` (D,)."""
     card: dict[str, Any]
     """How it was trained: task, quality, training step, mean return of 20 episodes, config, versions."""
     sha256: str = ""
@@ -53,7 +50,9 @@ class Actor:
         if "observation.mean" in self.weights:
             scaled = (state - self._double["observation.mean"]) / self._double["observation.std"]
             state = np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP)
-        hidden = self._features(state)
+        hidden = state
+        for layer in itertools.takewhile(lambda i: f"hidden.{i}.weight" in self.weights, itertools.count()):
+            hidden = np.maximum(self._linear(f"hidden.{layer}", hidden), 0.0)
         action = self._linear("mean", hidden)
         if rng is not None:
             log_std = np.clip(self._linear("log_std", hidden), *LOG_STD_RANGE)
@@ -63,23 +62,6 @@ class Actor:
     @cached_property
     def _double(self) -> dict[str, np.ndarray]:
         return {name: value.astype(np.float64) for name, value in self.weights.items()}
-
-    def _features(self, x: np.ndarray) -> np.ndarray:
-        """Output of the hidden layers, from which mean and log standard deviation are computed."""
-        if "embed.weight" not in self.weights:
-            for layer in itertools.takewhile(lambda i: f"hidden.{i}.weight" in self.weights, itertools.count()):
-                x = np.maximum(self._linear(f"hidden.{layer}", x), 0.0)
-            return x
-        x = self._linear("embed", x)
-        for block in itertools.takewhile(lambda i: f"block.{i}.up.weight" in self.weights, itertools.count()):
-            up = self._linear(f"block.{block}.up", self._normed(f"block.{block}.norm", x))
-            x = x + self._linear(f"block.{block}.down", np.maximum(up, 0.0))
-        return self._normed("norm", x)
-
-    def _normed(self, name: str, x: np.ndarray) -> np.ndarray:
-        centred = x - x.mean()
-        scale = self._double[f"{name}.scale"] / np.sqrt(centred.var() + LAYER_NORM_EPSILON)
-        return centred * scale + self._double[f"{name}.bias"]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._double[f"{name}.weight"] + self._double[f"{name}.bias"]
