@@ -25,7 +25,7 @@ from vd4rl_pomdp.runs.files import content_hash
 
 @dataclass(frozen=True)
 class HistoryOptions(Options):
-    """Options for encoders with memory; encoders without memory reject them."""
+    """Options for encoders with memory; without memory they are not read."""
 
     readout: Readout = "state"
     """Input of the policy: state (s_t), frame (e(o_t) only) or frame+state (both)."""

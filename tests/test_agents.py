@@ -1,5 +1,7 @@
 """An exported agent, loaded in one line, plays its card's episodes to the digit; what is damaged or unknown is told."""
 
+import io
+
 import numpy as np
 import pytest
 import torch
@@ -20,6 +22,7 @@ from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.report.films import side_by_side
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import read_run
@@ -92,6 +95,13 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
         write_json(out / "card.json", damaged)
         with pytest.raises(UserError, match=r"its files do not match card\.json"):
             load_agent(out)
+
+
+def test_a_film_shows_agents_that_see_frames_of_two_sizes():
+    shapes = [{"clean": (2, 3, size, size), "corrupted": (2, 9, size, size), "return": (2,)} for size in (84, 48)]
+    films = [{name: np.zeros(shape, np.uint8) for name, shape in one.items()} for one in shapes]
+    with Image.open(io.BytesIO(side_by_side(["large", "small"], films))) as moving:
+        assert moving.size == (4 * (2 * 84 + 4), 2 * 84 + 26 + 2 * 48 + 26)
 
 
 def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):

@@ -22,7 +22,9 @@ from vd4rl_pomdp.data.transfer import export_set, import_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.nn.policy import policy_step
 from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.results import find_results
 from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.plan import DataSet, plan_jobs
 
 LENGTHS = [20, 25, 9]
@@ -443,7 +445,8 @@ def test_the_environment_tells_the_task(minari, tmp_path, capsys):
 
 
 def test_a_set_without_a_task_trains_and_is_not_evaluated(tmp_path, own_cache):
-    folder = import_set("vd4rl", str(write_fake_set(tmp_path / "own", LENGTHS)), tmp_path / "pushing")[0].parent
+    source = str(write_fake_set(tmp_path / "own", LENGTHS))
+    folder = import_set("vd4rl", source, tmp_path / "pushing", quality="x")[0].parent
     pretrain(smoke_pretrain(folder, tmp_path / "run"))
     assert "Imported from vd4rl: bytes" in (folder / "card.md").read_text()
     encoder, out = tmp_path / "run" / "encoder", tmp_path / "policy"
@@ -459,6 +462,7 @@ def test_a_set_without_a_task_trains_and_is_not_evaluated(tmp_path, own_cache):
     cells = load_grid(str(tmp_path / "g.toml")).cells()
     jobs, _ = plan_jobs(cells, tmp_path, tmp_path / "sets")
     assert [job.finished for job in jobs] == [True] * 3, "a grid finds both runs"
+    assert len(GridMembers("g.toml", cells).among(find_results([tmp_path]))) == 2, "and so does its report"
 
 
 def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):

@@ -220,7 +220,7 @@ def test_options_of_a_corruption_are_flags_and_its_rows_tell_of_those_that_are_n
         evaluate_run(run, "patch", 1, 1, patch_sise=3)
 
 
-def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, run, tmp_path, capsys):
+def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, run, tmp_path, capsys, monkeypatch):
     before = read_episodes(run / "episodes.csv")
     words = ["evaluate", str(run), "--episodes", "2", "--workers", "1", "--keep"]
     for option in ([], ["--patch-size", "24"]):
@@ -239,6 +239,16 @@ def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, r
     found = tables.elsewhere(episodes_frame(load_runs([run])))
     assert found["evaluated_under"].tolist() == ["patch", "patch, patch_size 24"]
     assert found["score"].tolist() == pytest.approx([1.175, 1.175])
+    play_all = evaluation.evaluate
+
+    def meanwhile(*jobs):  # another process keeps the same
+        append_episodes(run / "episodes.csv", [rows[-1] | {"evaluated_under": "truncate"}])
+        return play_all(*jobs)
+
+    monkeypatch.setattr(evaluation, "evaluate", meanwhile)
+    with pytest.raises(SystemExit):
+        main([*words, "--corruption", "truncate"])
+    assert [row["evaluated_under"] for row in read_episodes(run / "episodes.csv")].count("truncate") == 1
     (run / "timing.json").unlink()
     with pytest.raises(UserError, match="is not finished"):
         evaluation.refuse_kept(run, "truncate")

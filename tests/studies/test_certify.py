@@ -63,6 +63,13 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     assert told["why"].endswith(", too few seeds, itself too low to judge; no returns")
     assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
     assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
+    (states / "certificates.json").unlink()
+    (states / "certificates.json").mkdir()  # nor can it be written to a dataset that is read-only
+    main(words)
+    shown = capsys.readouterr()
+    assert f"patch: {told['verdict']} ({told['why']})" in shown.out
+    assert f"the certificate is in {out} alone" in shown.err
+    (states / "certificates.json").rmdir()
 
     before, carried[:] = contents(out / MEMORY), []
     main([*words, *POLICIES.split(), "--returns"])

@@ -72,7 +72,7 @@ def import_set(
         format: Name of the format, as in `vd4rl-pomdp list`.
         source: Path or name of the dataset.
         out: Folder of the new dataset.
-        task: Its task, if the source does not name one; a dataset of an unregistered task can only train encoders.
+        task: Its task, if the source does not name one; an unregistered one needs `finetune --eval-episodes 0`.
         quality: Name of the behaviour that made the data.
         size: Height and width to resize images to, by area; default: no resizing.
         picture: Observation key of the images, if there are several.

@@ -124,6 +124,8 @@ def evaluate(words: list[str], program: str) -> None:
     if asked.keep and there:
         refuse_kept(run, another(trained, asked.corruption or "", options)[1])
     rows, played = evaluate_run(run, asked.corruption, asked.episodes, asked.workers, **options)
+    if asked.keep:
+        refuse_kept(run, rows[0]["evaluated_under"])  # again: another process may have kept the same meanwhile
     for file in [*([out] if out else []), *([run / EPISODES_FILE] if asked.keep else [])]:
         append_episodes(file, rows)
     reference = Reference.read(run)

@@ -82,6 +82,8 @@ def side_by_side(names: Sequence[str], films: Sequence[Film]) -> bytes:
     frames = []
     for shot in range(max(len(film["clean"]) for film in films)):
         rows = [_row(name, film, min(shot, len(film["clean"]) - 1)) for name, film in zip(names, films, strict=True)]
+        wide = max(row.shape[1] for row in rows)  # agents may see frames of different sizes
+        rows = [np.pad(row, ((0, 0), (0, wide - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
         frames.append(Image.fromarray(np.concatenate(rows)))
     return _webp(frames, 70)
 

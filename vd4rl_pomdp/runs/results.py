@@ -405,8 +405,7 @@ def _contradictions(run: Result) -> Iterator[str]:
         gamma = config.get("gamma", 1)
         if None not in (data, mean) and gamma < 1 and abs(data - mean / (1 - gamma)) > _ROUNDING:
             yield f"its critic tells of data worth {data}, their mean reward {mean} makes {mean / (1 - gamma):.4f}"
-        if run.rows:
-            yield from _astray(run)
+        yield from _astray(run)
 
 
 def _astray(run: Result) -> Iterator[str]:
@@ -426,10 +425,10 @@ def _astray(run: Result) -> Iterator[str]:
         judged = [(step, under) for step, under in played if run.finished or step <= end]
         wanted |= {(step, under): 0 for step, under in judged if step != last or under == own}
         wanted |= {(step, own): count for step in {*range(every, end + 1, every), *[last] * run.finished}}
-        if run.finished and config.get("eval_clean") and own != "none":
+        if run.finished and config.get("eval_clean") and own != "none" and count:
             wanted[last, "none"] = config.get("eval_clean_episodes") or count
     for (step, under), count in sorted(wanted.items()):
-        numbers = sorted(played.get((step, under), []))
+        numbers = played.get((step, under), [])
         if numbers != list(range(count)):
             yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
     task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})

@@ -13,6 +13,7 @@ policy. Such a memory is needed if the first scores above the second and the thi
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -125,8 +126,12 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
         "seeds": sorted({cell.seed for cell in cells}),
         **{"version": __version__, "commit": git_commit(), "made": datetime.now(UTC).isoformat(timespec="seconds")},
     }
-    for folder in (out, dataset.path if dataset.path.is_dir() else dataset.path.parent):
-        keep_certificates(folder, {certificate_id(dataset.fingerprint, hidden): certificate})
+    made = {certificate_id(dataset.fingerprint, hidden): certificate}
+    keep_certificates(out, made)
+    try:
+        keep_certificates(dataset.path if dataset.path.is_dir() else dataset.path.parent, made)
+    except UserError as error:  # a shared dataset may be read-only
+        print(f"warning: {error}; the certificate is in {out} alone", file=sys.stderr)
     return certificate
 
 

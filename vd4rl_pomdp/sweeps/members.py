@@ -55,7 +55,8 @@ class GridMembers(Choice):
     def _has(self, run: Result) -> bool:
         """Whether some cell asks for this run. Without collection settings (imported data), task and quality decide."""
         sets = self._sets.get(run.recipe, ())
-        if run.record.get("collection"):
+        collection = run.record.get("collection")
+        if collection and "format" not in collection:
             return run.on_one_set and any(data.alike(run.record) for data in sets)
         labels = {name: run.labels[name] for name in ("task", "quality")}
         return run.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)

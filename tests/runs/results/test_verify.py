@@ -78,7 +78,7 @@ def test_episodes_are_of_the_run_that_they_name_each_once_and_scored_by_their_re
 
 OWN = "patch+zero_frames"
 EDITED_ROWS = [
-    (0, {"episode": "5"}, f"at step 20 under {OWN} it has the episodes [1, 5], its record 2, from 0 on"),
+    (0, {"episode": "5"}, f"at step 20 under {OWN} it has the episodes [5, 1], its record 2, from 0 on"),
     (1, {"step": "30"}, f"at step 20 under {OWN} it has the episodes [0], its record 2, from 0 on"),
     (2, {"step": "60"}, f"at step 60 under {OWN} it has the episodes [0], its record 0, from 0 on"),
     (3, {"evaluated_under": "none"}, f"at step 40 under {OWN} it has the episodes [0], its record 2, from 0 on"),
@@ -128,6 +128,13 @@ def test_what_was_edited_by_hand_is_found(data, encoder, tmp_path):
         told = changed(results, edit)
         assert [one for one in told if said in one], (place, told)
         (results / "runs.jsonl").write_text(whole[results / "runs.jsonl"])
+    head, first, second, *others = whole[results / "episodes.csv"].splitlines(keepends=True)
+    (results / "episodes.csv").write_text("".join([head, second, first, *others]))
+    (told,) = verify_results(results)[1]  # intervals pair episodes by their place
+    assert told.endswith(f"at step 20 under {OWN} it has the episodes [1, 0], its record 2, from 0 on")
+    (results / "episodes.csv").write_text(head)
+    told = changed(results, lambda told: told.update(episodes=0))
+    assert len(told) == 3, "two evaluations and an uncorrupted one"
 
 
 def test_what_may_change_is_recorded_as_it_was_when_the_run_ended(data, encoder, tmp_path, monkeypatch):
