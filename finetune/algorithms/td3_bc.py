@@ -44,7 +44,7 @@ class TD3BCOptions(ReturnOptions):
 class TwinCritic(nn.Module):
     """Two independent Q functions: (B, D), (B, A) -> two (B,); each is a new network (B, D + A) -> (B, 1)."""
 
-    def __init__(self, network: Callable[[], nn.Module]) -> None:
+    def __init__(self, network: Callable[[], nn.Sequential]) -> None:
         super().__init__()
         self.first, self.second = network(), network()
 

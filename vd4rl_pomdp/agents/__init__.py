@@ -42,7 +42,6 @@ class Agent:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the history at the start of an episode."""
         self._state = self.encoder.initial_state(1)
         self._action = torch.zeros(1, self.encoder.config.action_dim)  # as at first rows in training
 

@@ -65,7 +65,6 @@ class Registry(Mapping[str, Part], Generic[Part]):
 
     @property
     def has_added(self) -> bool:
-        """Whether this process registered a plug-in by a call."""
         return BY_CALL in self._origins.values()
 
     def registered(self) -> dict[str, Part]:

@@ -44,7 +44,6 @@ class _Draw:
 
     @property
     def size(self) -> int:
-        """Size in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 

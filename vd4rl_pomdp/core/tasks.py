@@ -108,7 +108,6 @@ class Task:
 
     @property
     def summary(self) -> str:
-        """One-line description."""
         return f"each action {self.action_repeat} times, {self.decisions} decisions an episode"
 
 
@@ -127,7 +126,6 @@ class DMCTask(Task):
 
     @property
     def summary(self) -> str:
-        """One-line description."""
         own = "." in self.domain
         title = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
         return f"{title}, camera {self.camera}, {super().summary}"
@@ -155,7 +153,6 @@ class GymnasiumTask(Task):
 
     @property
     def summary(self) -> str:
-        """One-line description."""
         return f"Gymnasium's {self.name}, {super().summary}"
 
 

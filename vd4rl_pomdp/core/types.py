@@ -59,7 +59,6 @@ class Batch:
         return iter(self.keys())
 
     def keys(self) -> tuple[str, ...]:
-        """Names of the tensors."""
         return tuple(f.name for f in fields(self))
 
     def to(self, device: torch.device | str) -> Self:
@@ -68,7 +67,6 @@ class Batch:
         return self.replace(**{name: self[name].to(device, non_blocking=ahead) for name in self.keys()})
 
     def replace(self, **changes: Any) -> Self:
-        """Copy of the batch with some tensors replaced."""
         return replace(self, **changes)
 
 

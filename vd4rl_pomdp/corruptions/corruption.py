@@ -60,7 +60,6 @@ class Patch(Options):
     limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": (1, 1000), "patch_fill": (0, 255)}
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
-        """Fill the patches; see `Stage`."""
         n, k, _, height, width = frames.shape
         top, left = self._corners(key, number, height, width)
         # A view of every possible square, indexed by its corner: writing to it writes to the frames.
@@ -75,7 +74,6 @@ class Patch(Options):
 
     @property
     def hidden_value(self) -> int:
-        """See `Hiding`."""
         return self.patch_fill
 
     def places(self, key: Tensor, number: Tensor, height: int, width: int) -> Tensor:
@@ -83,7 +81,6 @@ class Patch(Options):
         return torch.stack(self._corners(key, number, height, width), -1)
 
     def hides(self, places: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        """See `Hiding`."""
         top, left = places[..., None, None].unbind(3)
         inside = (top <= y) & (y < top + self.patch_size) & (left <= x) & (x < left + self.patch_size)
         return inside.any(2)
@@ -132,7 +129,6 @@ class ZeroFrames(FrameDrop):
     limits: ClassVar[Limits] = {"zeroed_frames": 1}
 
     def dropped(self, stack: int) -> int:
-        """See `FrameDrop`."""
         if self.zeroed_frames > stack - self.keep_newest:
             newest = " and keep the newest" if self.keep_newest else ""
             raise UserError(
@@ -158,12 +154,10 @@ class Truncate(FrameDrop):
     summary: ClassVar[str] = "all frames of every stack but the newest, or the oldest, become 0; it must come last"
 
     def check(self) -> None:
-        """Raise UserError for invalid options."""
         refuse_unknown("--kept", self.kept, ("newest", "oldest"))
         super().check()
 
     def dropped(self, stack: int) -> int:
-        """See `FrameDrop`."""
         return stack - 1
 
     def order(self, key: Tensor, stack: int) -> Tensor:

@@ -89,5 +89,4 @@ class KeyStream:
         return next_keys(self.seed, self.position, tuple(shape))
 
     def go_to(self, position: int) -> None:
-        """Set the position."""
         self.position.fill_(position)

@@ -80,7 +80,6 @@ class Dataset:
 
     @property
     def num_rows(self) -> int:
-        """Number of rows N."""
         return len(self.t)
 
     @property
@@ -95,11 +94,9 @@ class Dataset:
 
     @property
     def frame_size(self) -> int:
-        """Height and width S of the frames."""
         return self.frames.shape[-1]
 
     def require_transitions(self) -> None:
-        """Raise UserError if the data set has no transition."""
         if not self.num_transitions:
             raise UserError(
                 f"{self.path}: holds no transitions, since every episode has a single row: choose another dataset"
@@ -107,7 +104,6 @@ class Dataset:
 
     @property
     def action_dim(self) -> int:
-        """Action dimension A."""
         return self.action.shape[1]
 
     def require_states(self) -> None:
@@ -254,7 +250,6 @@ class Dataset:
 
     @property
     def longest_episode(self) -> int:
-        """Number of rows of the longest episode."""
         return int(self.t.max()) + 1
 
     def windows_per_episode(self, length: int) -> Tensor:

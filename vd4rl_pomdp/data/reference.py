@@ -53,7 +53,6 @@ class Reference:
 
     @classmethod
     def parse(cls, path: Path, stored: dict[str, Any]) -> Self:
-        """Parse a file's content; UserError, naming the file, if it is damaged."""
         with damaged(path, "is damaged", "remove it to compare the run with no data"):
             values = {"mean_reward": None} | stored  # missing in earlier runs
             reference = build(cls, {field.name: values[field.name] for field in fields(cls)})
@@ -62,11 +61,9 @@ class Reference:
             return reference
 
     def with_path_error(self, error: float | None) -> Reference:
-        """A copy with the path error of a trained policy."""
         return replace(self, path_error=None if error is None else round(error, 6))
 
     def write(self, run: Path) -> None:
-        """Write it to a run's folder."""
         write_json(run / REFERENCE_FILE, asdict(self))
 
     @property

@@ -62,7 +62,6 @@ class Store:
 
     @property
     def frame_size(self) -> int:
-        """Height and width S of a frame."""
         return math.isqrt(self.meta["files"][_FRAMES]["bytes"] // (3 * self.meta["rows"]))
 
     def frames(self) -> np.ndarray:

@@ -197,7 +197,6 @@ class _Reader:
             return rows
 
     def notes(self) -> Iterator[str]:
-        """Warnings about the episodes read, such as clipped actions."""
         if self._clipped:
             yield f"{self._clipped} actions lay outside their bounds and were clipped"
         if self._still and self._still == self._read:

@@ -137,11 +137,9 @@ class View:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Positions of the random streams."""
         return {"corruption": int(self.corruption.stream.position), "shift": int(self.shifts.position)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
         self.corruption.stream.go_to(state["corruption"])
         self.shifts.go_to(state["shift"])
 
@@ -192,7 +190,7 @@ class StateView(View):
 
 
 class Sampler(ABC):
-    """Samples batches uniformly over the data set, with replacement.
+    """Samples batches uniformly over the data set, with replacement; its state is all that later batches depend on.
 
     Random numbers are drawn on the CPU, so the batches do not depend on the data set's device.
     """
@@ -203,11 +201,9 @@ class Sampler(ABC):
         self._batch_size, self.draws = batch_size, draws
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue with the same batches."""
         return {"batches": self.draws.get_state(), "view": self.view.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
         self.draws.set_state(state["batches"])
         self.view.load_state_dict(state["view"])
 
@@ -231,7 +227,6 @@ class WindowSampler(Sampler):
         self._length, self._count = length, self.view.dataset.num_windows(length)
 
     def sample(self) -> Windows:
-        """The next batch, on the data set's device."""
         return self.view.windows(self._draw(self._count), self._length)
 
 
@@ -252,5 +247,4 @@ class TransitionSampler(Sampler):
         self._n_step, self._gamma = n_step, gamma
 
     def sample(self) -> Transitions:
-        """The next batch, on the data set's device."""
         return self.view.transitions(self._draw(self.view.dataset.num_transitions), self._n_step, self._gamma)

@@ -41,7 +41,6 @@ class DMCEnv(PixelEnv):
 
     @property
     def physics(self) -> Any:
-        """dm_control's physics."""
         return self.simulator.physics
 
     @property
@@ -65,11 +64,9 @@ class DMCEnv(PixelEnv):
 
     @property
     def rate(self) -> float:
-        """Decisions per second of simulated time."""
         return 1 / (self.simulator.control_timestep() * self.task.action_repeat)
 
     def close(self) -> None:
-        """Free the simulator and its OpenGL context."""
         self.physics.free()
 
     def _begin(self, seed: int) -> None:

@@ -71,7 +71,6 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._frame
 
     def close(self) -> None:
-        """Free the simulator and its renderer; the environment cannot be used afterwards."""
         self._env.env.close()
 
     def _draw(self) -> int:

@@ -74,7 +74,6 @@ class GymnasiumEnv(PixelEnv):
 
     @property
     def layout(self) -> Layout:
-        """The environment's action dimension; it has no states."""
         return Layout(int(np.prod(self._space.shape)))
 
     @property
@@ -98,7 +97,6 @@ class GymnasiumEnv(PixelEnv):
         return float(rate) / self.task.action_repeat
 
     def close(self) -> None:
-        """Close the Gymnasium environment."""
         self.env.close()
 
     @contextmanager

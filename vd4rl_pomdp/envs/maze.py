@@ -131,7 +131,6 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.ascontiguousarray(self._picture.transpose(1, 2, 0))
 
     def close(self) -> None:
-        """Free the GL context, if there is one."""
         if isinstance(self._renderer, ExactRenderer):
             self._renderer.close()
 

@@ -53,7 +53,6 @@ class ExactRenderer:
             return self.renderer.render().copy()
 
     def close(self) -> None:
-        """Free the GL context."""
         self.renderer.close()
 
 

@@ -128,7 +128,6 @@ class MazeSpec:
 
     @property
     def gym_id(self) -> str:
-        """Gymnasium id."""
         return f"vd4rl_pomdp/Maze{self.name.title().replace('_', '')}-v0"
 
     @property
@@ -143,7 +142,6 @@ class MazeSpec:
 
     @property
     def position(self) -> list[int]:
-        """Indices of the position in a state."""
         return [0, 1]
 
     @property

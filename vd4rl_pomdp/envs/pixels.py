@@ -42,7 +42,6 @@ class TimeStep:
 
     @property
     def last(self) -> bool:
-        """Whether the episode ends here."""
         return self.step_type == StepType.LAST
 
     @property
@@ -111,7 +110,6 @@ class PixelEnv(ABC):
 
     @property
     def action_dim(self) -> int:
-        """Action dimension A."""
         return self.layout.action_dim
 
     def reset(self, seed: int) -> TimeStep:
@@ -155,12 +153,10 @@ class ResetAfterEnd(gymnasium.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordC
         self._over = False
 
     def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start the next episode."""
         self._over = False
         return self.env.reset(**options)
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        """Apply one action, unless the episode is over."""
         if self._over:
             raise ResetNeeded("the episode is over: call reset() before the next step()")
         result = self.env.step(action)

@@ -39,7 +39,8 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
     """Write an encoder folder; `frames` is the number of frames in all pretraining batches, if known."""
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
-    _write(Path(folder), replace(record, **code_of(record.parts)), save(weights))
+    third_party = code_of(record.parts)
+    _write(Path(folder), replace(record, plugins=third_party["plugins"], sources=third_party["sources"]), save(weights))
 
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:

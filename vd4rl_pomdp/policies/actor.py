@@ -62,7 +62,6 @@ class Actor:
 
     @cached_property
     def _double(self) -> dict[str, np.ndarray]:
-        """The weights in float64."""
         return {name: value.astype(np.float64) for name, value in self.weights.items()}
 
     def _features(self, x: np.ndarray) -> np.ndarray:
@@ -86,7 +85,6 @@ class Actor:
         return x @ self._double[f"{name}.weight"] + self._double[f"{name}.bias"]
 
     def save(self, path: Path) -> None:
-        """Write the actor to a safetensors file, with its card as JSON in the header."""
         _save(self.weights, self.card, path)
 
 
@@ -124,7 +122,6 @@ class Ladder:
         return self.rungs[nearest - 1] if nearest else None
 
     def save(self, path: Path) -> None:
-        """Write the ladder to a safetensors file, with its card as JSON in the header."""
         _save(self.weights, self.card, path)
 
 
