@@ -34,7 +34,7 @@ from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
 from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX
+from vd4rl_pomdp.studies.navigation.runs import RAW_PREFIX
 from vd4rl_pomdp.studies.navigation.train import COMPONENTS
 from vd4rl_pomdp.studies.navigation.train import train as run_navigation
 

@@ -9,14 +9,13 @@ the table has with the same actors are not played again.
 
 from __future__ import annotations
 
-import csv
 import tempfile
 import time
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 from script import run_script
 
 from vd4rl_pomdp.core.errors import refuse_outside, refuse_unknown
@@ -24,13 +23,12 @@ from vd4rl_pomdp.core.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, play
 from vd4rl_pomdp.data.folder import PROVENANCE
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.files import Row, groups, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 
 CORES = 2
 RETURNS = ("task", "quality", "episode", "return")
 COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
-SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
 
 
 @dataclass(frozen=True)
@@ -39,8 +37,7 @@ class Config:
 
     out: Path = Path("results/datasets")
     """Folder of returns.csv (one row per episode), costs.csv (one per task), actors.json (hashes of each dataset's
-    actors)
-        and the table, sets.csv.
+    actors) and the table, sets.csv.
     """
     tasks: tuple[str, ...] = tuple(TASKS)
     qualities: tuple[str, ...] = tuple(SET_QUALITIES)
@@ -78,28 +75,24 @@ def main(config: Config) -> None:
         if not any(row["task"] == task for row in costs):
             costs.append(cost(task, config.timed_episodes))
             write_csv(out / "costs.csv", COSTS, costs)
-    write_csv(out / "sets.csv", SETS, summarise(returns, costs))
+    summarise(returns, costs).to_csv(out / "sets.csv", index=False, float_format="%.1f", lineterminator="\n")
     write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
 
 
 def rows_of(path: Path) -> list[Row]:
-    """Rows of an existing table; empty if there is none."""
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    """Rows of an existing table, as text; empty if there is none."""
+    return pd.read_csv(path, dtype=str).to_dict("records") if path.exists() else []
 
 
-def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
-    """The table, from raw rows."""
-    seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
-    table, by_set = [], groups(returns, lambda row: (row["task"], row["quality"]))
-    for task, quality in product(dict.fromkeys(row["task"] for row in returns), SET_QUALITIES):
-        if mine := [float(row["return"]) for row in by_set.get((task, quality), ())]:
-            row = {"task": task, "quality": quality, "episodes": len(mine), "seconds_100k": round(seconds[task])}
-            statistics = {"mean": np.mean(mine), "min": min(mine), "max": max(mine)}
-            table.append(row | {name: f"{value:.1f}" for name, value in statistics.items()})
-    return table
+def summarise(returns: list[Row], costs: list[Row]) -> pd.DataFrame:
+    """The table, from raw rows: tasks in the order of the rows, qualities in that of SET_QUALITIES."""
+    frame = pd.DataFrame(returns).astype({"return": float})
+    for column, order in (("task", frame["task"].unique()), ("quality", list(SET_QUALITIES))):
+        frame[column] = pd.Categorical(frame[column], order)
+    by_set = frame.groupby(["task", "quality"], observed=True)["return"]
+    table = by_set.agg(episodes="count", mean="mean", min="min", max="max").reset_index()
+    per_row = {row["task"]: float(row["cpu_seconds"]) / float(row["rows"]) for row in costs}
+    return table.assign(seconds_100k=[round(per_row[task] * 1e5 / CORES) for task in table["task"]])
 
 
 def cost(task: str, episodes: int) -> Row:

@@ -96,8 +96,8 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         Files by quality: `expert`, `medium`, `replay`.
     """
     curve = read_curve(run)
-    kept = [row for row in curve if snapshot_path(run, row[0]).exists()]
-    if not kept:
+    rows = [row for row in curve if snapshot_path(run, row[0]).exists()]
+    if not rows:
         raise UserError(f"{run}: keeps no snapshot of an actor; name the folder of a training run, not of an export")
     config = json.loads((run / SETTINGS).read_text(encoding="utf-8"))
     name = config["task"]
@@ -106,10 +106,10 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         actors = {step: read_actor(snapshot_path(run, step)) for step, _ in rows}
         return {step: episode_returns(actor, TASKS.named(name), CARD_EPISODES) for step, actor in actors.items()}
 
-    judged = judge(sorted(kept, key=lambda row: row[1])[-3:])
+    judged = judge(sorted(rows, key=lambda row: row[1])[-3:])
     expert = max(judged, key=lambda step: float(np.mean(judged[step])))
     half = float(np.mean(judged[expert])) / 2
-    near = sorted((row for row in kept if row[0] < expert), key=lambda row: abs(row[1] - half))[:3]
+    near = sorted((row for row in rows if row[0] < expert), key=lambda row: abs(row[1] - half))[:3]
     judged |= judge(near)
     medium = min((step for step, _ in near), key=lambda step: abs(float(np.mean(judged[step])) - half), default=expert)
     out.mkdir(parents=True, exist_ok=True)
@@ -126,12 +126,12 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         card |= {"returns_seeds": [CARD_SEED, CARD_SEED + CARD_EPISODES - 1], "config": config}
         card["versions"] = actor.card.get("versions", {}) | here
         Actor(actor.weights, card).save(path)
-        told = json.dumps(card | {"learning_curve": curve}, indent=1)
-        write_bytes(path.with_suffix(".json"), f"{told}\n".encode())
-    rows = [row for row in kept if row[0] <= medium]
-    chosen = sorted({round(i) for i in np.linspace(0, len(rows) - 1, min(LADDER_RUNGS, len(rows)))})
-    steps = [rows[i][0] for i in chosen]
-    of = {"task": name, "decisions": steps, "curve": [rows[i][1] for i in chosen]}
+        text = json.dumps(card | {"learning_curve": curve}, indent=1)
+        write_bytes(path.with_suffix(".json"), f"{text}\n".encode())
+    rungs = [row for row in rows if row[0] <= medium]
+    chosen = sorted({round(i) for i in np.linspace(0, len(rungs) - 1, min(LADDER_RUNGS, len(rungs)))})
+    steps = [rungs[i][0] for i in chosen]
+    of = {"task": name, "decisions": steps, "curve": [rungs[i][1] for i in chosen]}
     Ladder.of([read_actor(snapshot_path(run, step)) for step in steps], of).save(files["replay"])
     return files
 

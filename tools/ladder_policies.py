@@ -66,24 +66,26 @@ def main(config: Config) -> None:
     runs = config.work / "runs"
     for run in sorted(path.parent for path in runs.rglob(f"finetune-*/{TIMING_FILE}")):
         name = run.relative_to(runs).as_posix()
-        kept = {int(file.stem): file for file in (config.work / "snapshots" / name).glob("*.safetensors")}
-        lacking = [step for step in sorted(kept) if (name, step) not in known]
+        snapshots = {int(file.stem): file for file in (config.work / "snapshots" / name).glob("*.safetensors")}
+        lacking = [step for step in sorted(snapshots) if (name, step) not in known]
         if lacking:
             print(name, file=sys.stderr)
-            found = measure(run, kept, lacking, config.work)
+            found = measure(run, snapshots, lacking, config.work)
             rows += [dict(zip(columns, (name, *row), strict=True)) for row in found]
             rows.sort(key=lambda row: (row["run"], *(int(row[column]) for column in order)))
             write_csv(out, columns, rows)
 
 
-def cloning(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
+def cloning(run: Path, snapshots: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
     """Update, loss on the run's own dataset and loss on held-out episodes, for a run's policies."""
     made = read_json(run / CONFIG_FILE)["collection"]
     held_out = work / "held_out" / made["task"] / made["quality"]
     if not (held_out / PROVENANCE).exists():
         collect(CollectConfig(made["task"], made["quality"], held_out, EPISODES, SEED, episodes_per_shard=10))
-    losses = [cloning_losses(run, [kept[step] for step in lacking], data) for data in (None, held_out)]
-    return [(step, f"{own:.6f}", f"{other:.6f}") for step, own, other in zip(lacking, *losses, strict=True)]
+    losses = [cloning_losses(run, [snapshots[step] for step in lacking], data) for data in (None, held_out)]
+    return [
+        (step, f"{trained_on:.6f}", f"{other:.6f}") for step, trained_on, other in zip(lacking, *losses, strict=True)
+    ]
 
 
 @torch.no_grad()
@@ -99,11 +101,11 @@ def cloning_losses(run: Path, files: list[Path], data: Path | None) -> list[floa
     """
     config = read_json(run / CONFIG_FILE)["config"]
     record = read_json(run / "encoder" / CONFIG_FILE)
-    told = record["encoder"]
-    if "gru_layers" in told:  # folders from before memory options
-        layers = told.pop("gru_layers")
-        told["memory_options"] = {"gru_layers": layers} if told["history"] == "gru" else {}
-    encoder = Encoder(EncoderConfig(**told))
+    settings = record["encoder"]
+    if "gru_layers" in settings:  # folders from before memory options
+        layers = settings.pop("gru_layers")
+        settings["memory_options"] = {"gru_layers": layers} if settings["history"] == "gru" else {}
+    encoder = Encoder(EncoderConfig(**settings))
     encoder.load_state_dict(read_tensors(run / "encoder" / "model.safetensors"))
     dataset, corruption = open_dataset(data or config["data"]), CorruptionConfig.fill(record["pretrain"]["corruption"])
     frozen = FrozenEncoder(encoder.eval(), dataset, corruption, 0, config["precision"], config["seed"])
@@ -120,13 +122,13 @@ def cloning_losses(run: Path, files: list[Path], data: Path | None) -> list[floa
     return [float(np.concatenate(found).mean()) for found in squares]
 
 
-def averages(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
+def averages(run: Path, snapshots: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:
     """Update, number of averaged rungs, episode and return of a run's average policies, if its encoder is trained."""
     found: list[tuple[Any, ...]] = []
     labels, config = read_json(run / LABELS_FILE), read_json(run / CONFIG_FILE)["config"]
-    for step in sorted(kept)[3::2] if labels["method"] != "random" else []:
+    for step in sorted(snapshots)[3::2] if labels["method"] != "random" else []:
         if step in lacking:
-            files = [kept[rung] for rung in sorted(kept) if step / 2 < rung <= step]
+            files = [snapshots[rung] for rung in sorted(snapshots) if step / 2 < rung <= step]
             scratch = work / "averaged"
             shutil.rmtree(scratch, ignore_errors=True)
             shutil.copytree(run, scratch, ignore=shutil.ignore_patterns("checkpoints"))
@@ -139,8 +141,8 @@ def averages(run: Path, kept: Mapping[int, Path], lacking: list[int], work: Path
                 save_file(mean, scratch / "policy" / "model.safetensors", metadata=file.metadata())
             under = ["--corruption", labels["corruption"], "--episodes", str(config["eval_episodes"])]
             words = [PROGRAM, "evaluate", str(scratch), *under, "--workers", "1", "--json"]
-            told = json.loads(subprocess.run(words, stdout=subprocess.PIPE, check=True).stdout)
-            for each in told["under"][labels["corruption"]]["episodes"]:
+            result = json.loads(subprocess.run(words, stdout=subprocess.PIPE, check=True).stdout)
+            for each in result["under"][labels["corruption"]]["episodes"]:
                 found.append((step, len(files), each["episode"], round(each["return"], 4)))
     return found
 

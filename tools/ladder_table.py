@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from script import run_script
 
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.text import table_lines
@@ -77,8 +76,8 @@ class Key(NamedTuple):
     def lever(self) -> str:
         """Settings that differ from the base, in words."""
         words = ("{:,} units", "{}", "{:,} steps", "{} episodes", "{} views")
-        told = zip(words, self[4:], BASE, strict=True)
-        return ", ".join(word.format(value) for word, value, base in told if value != base)
+        settings = zip(words, self[4:], BASE, strict=True)
+        return ", ".join(word.format(value) for word, value, base in settings if value != base)
 
     @property
     def called(self) -> str:
@@ -138,8 +137,8 @@ def budget(cells: Sequence[Cell]) -> int | None:
     """
     rungs = set.intersection(*(set(cell.converged()) for cell in cells)) if cells else set()
     lowest = [min((cell.held_out[rung] for rung in rungs), default=0.0) for cell in cells]
-    told = list(zip(cells, lowest, strict=True))
-    return min((rung for rung in rungs if all(cell.held_out[rung] <= NEAR * low for cell, low in told)), default=None)
+    pairs = list(zip(cells, lowest, strict=True))
+    return min((rung for rung in rungs if all(cell.held_out[rung] <= NEAR * low for cell, low in pairs)), default=None)
 
 
 def cells_in(folder: Path = RESULTS) -> list[Cell]:
@@ -163,16 +162,16 @@ def cells_in(folder: Path = RESULTS) -> list[Cell]:
             key, clean = _key(run.record["collection"], card, config), clean[-len(returns[max(returns)]) :]
             data, gamma = run.files["reference"]["data_return"], config["gamma"]
             cells[key] = Cell(key, **known[name], returns=returns, clean=clean, data_return=data, gamma=gamma)
-    return [cells[key] for key in asked() if key in cells]
+    return [cells[key] for key in grid_keys() if key in cells]
 
 
 def _key(made: Row, before: Row, after: Row) -> Key:
     place = made["task"], made["quality"], before["corruption"], before["method"]
-    own = after["hidden_dim"], after["update_precision"], before["steps"], made["episodes"], after["views"]
-    return Key(*place, *own)
+    settings = after["hidden_dim"], after["update_precision"], before["steps"], made["episodes"], after["views"]
+    return Key(*place, *settings)
 
 
-def asked() -> list[Key]:
+def grid_keys() -> list[Key]:
     """All cells of the ladder's grid, in order."""
     cells = load_grid(str(RESULTS / "grid.toml")).cells()
     return [_key(collection_of(cell), recorded(cell, "pretrain"), recorded(cell, "finetune")) for cell in cells]
@@ -184,7 +183,7 @@ def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
     for cell in cells:
         best = max(cell.returns, key=lambda rung: np.mean(_of(cell, rung)))
         last, lowest = max(cell.returns), min(cell.held_out, key=cell.held_out.__getitem__)
-        told = [
+        row = [
             f"{cell.key.setting} ({cell.data_return:.0f})",
             cell.key.called,
             *(f"{mean_and_error(_of(cell, rung))} ({rung:,})" for rung in (best, last)),
@@ -194,7 +193,7 @@ def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
             f"{cell.held_out[lowest]:.4f} ({lowest:,}), {cell.held_out[last]:.4f}",
             f"{cell.trained_on[last]:.4f}, {cell.batches[last]:.4f}",
         ]
-        rows.append(told)
+        rows.append(row)
     head = ["set (data's return)", "policy", "best rung: return (updates)", "last rung: return (updates)"]
     head += ["the same, played clean", "critic converged at (updates)", "its value at the end; the data's own"]
     head += ["held-out cloning loss: lowest (updates), last", "last on episodes of the set, on batches"]
@@ -220,12 +219,12 @@ def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
     rungs, rows = sorted({rung for cell in cells for rung in cell.returns}), []
     by_key = {cell.key: cell for cell in cells}
     for cell in cells:
-        told = {rung: (mean_and_error(_of(cell, rung)), drift(cell.q, rung)) for rung in cell.returns}
+        by_rung = {rung: (mean_and_error(_of(cell, rung)), drift(cell.q, rung)) for rung in cell.returns}
         three = cell.held_out, cell.trained_on, cell.batches
         lines = {
-            "return": {rung: text for rung, (text, _) in told.items()},
-            "critic": {rung: f"{cell.q[rung]:.0f} ({moved:+.1%})" for rung, (_, moved) in told.items()},
-            "cloning": {rung: "; ".join(f"{loss[rung]:.3f}" for loss in three) for rung in told},
+            "return": {rung: text for rung, (text, _) in by_rung.items()},
+            "critic": {rung: f"{cell.q[rung]:.0f} ({moved:+.1%})" for rung, (_, moved) in by_rung.items()},
+            "cloning": {rung: "; ".join(f"{loss[rung]:.3f}" for loss in three) for rung in by_rung},
         }
         rows += [(cell.key.setting, cell.key.called, what, line) for what, line in lines.items()]
         other = by_key.get(cell.key._replace(method="mik+a"))
@@ -235,22 +234,22 @@ def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
                 text = mean_and_error([value - one[seed] for seed, value in other.returns[rung].items()])
                 line[rung] = text if text.startswith("-") else f"+{text}"
             rows.append((cell.key.setting, f"`mik+a` less {cell.key.called}", "return", line))
-    shown = ((*words, *(line.get(rung, "") for rung in rungs)) for *words, line in rows)
-    return table_lines(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), shown, (0, 1, 2))
+    table = ((*words, *(line.get(rung, "") for rung in rungs)) for *words, line in rows)
+    return table_lines(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), table, (0, 1, 2))
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
     """The rule's budget per task and width, and the runs that it still lacks."""
-    wanted = groups((key for key in asked() if key.counts), lambda key: (key.task, key.units))
+    wanted = groups((key for key in grid_keys() if key.counts), lambda key: (key.task, key.units))
     rows = []
     for (task, units), keys in sorted(wanted.items(), key=lambda item: (-ord(item[0][0][0]), item[0][1])):
         mine = [cell for cell in cells if cell.key in keys]
         there, found = {cell.key for cell in mine}, budget(mine)
-        told = "–" if not mine else "no rung" if found is None else f"{found:,}"
+        updates = "–" if not mine else "no rung" if found is None else f"{found:,}"
         hidden = {key: ", nothing hidden" * (key.corruption == "none") for key in keys if key not in there}
         missing = "; ".join(f"{key.quality}, `{key.method}`{words}" for key, words in hidden.items())
-        told += " so far" * bool(mine and missing)
-        rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", told, missing or "all are there"))
+        updates += " so far" * bool(mine and missing)
+        rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", updates, missing or "all are there"))
     head = ("task", "units", "cells that count, of those required", "updates by the rule", "not run yet")
     return table_lines(head, rows, (0, 4))
 
@@ -303,12 +302,7 @@ PANELS = {"return": _draw_returns, "critic": _draw_critic, "cloning loss": _draw
 """Function that draws a run, by panel title."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """Draw results/ladder/ladder.png and print the budgets. No options."""
-
-
-def main(config: Config) -> None:
+def main() -> None:
     """Write the figure and print the budgets."""
     cells = cells_in()
     figure(cells).savefig(RESULTS / "ladder.png", dpi=150)
@@ -316,4 +310,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_script(main, Config)
+    main()

@@ -33,7 +33,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 work = Path(sys.argv[1])
 given = np.load(work / "given.npz")
-told = {"lerobot": lerobot.__version__}
+report = {"lerobot": lerobot.__version__}
 for name in ("lerobot", "lerobot_video"):
     for backend in ("torchcodec", "pyav"):
         data = LeRobotDataset("a/b", root=work / name, video_backend=backend, tolerance_s=1e-4)
@@ -47,11 +47,11 @@ for name in ("lerobot", "lerobot_video"):
         assert {row["task"] for row in rows} == {"walker_walk"}
         change = np.abs(pixels - given["observation"])
         off = f"pixels off by {change.mean():.3f}, at most {change.max():.0f}"
-        told[f"{name}, read by {backend}"] = f"{len(rows)} rows, {off}"
+        report[f"{name}, read by {backend}"] = f"{len(rows)} rows, {off}"
     data = LeRobotDataset("a/b", root=work / name)
     fewer = delete_episodes(data, [1], output_dir=work / (name + "_fewer"), repo_id="a/c")
     mean = fewer.meta.stats["action"]["mean"].round(3).tolist()
-    told[f"{name}, an episode deleted"] = f"{len(fewer)} rows, mean of actions {mean}"
+    report[f"{name}, an episode deleted"] = f"{len(fewer)} rows, mean of actions {mean}"
 
 picture = {"shape": (84, 84, 3), "names": ["height", "width", "channels"]}
 kinds = {"image": {"observation.image": {"dtype": "image", **picture}}}
@@ -71,7 +71,7 @@ for kind, cameras in kinds.items():
         frame |= {"action": given["action"][i + 1] * 3, "next.reward": reward}
         data.add_frame(frame | {"next.done": np.array([given["end"][i + 1]]), "task": "Walk over there."})
     data.finalize()
-print(json.dumps(told))
+print(json.dumps(report))
 """
 
 
@@ -104,19 +104,19 @@ def main(work: Path) -> None:
     )
     for name, value in json.loads(done.stdout.splitlines()[-1]).items():
         print(f"{name}: {value}")
-    kept = rows["step_type"] != 2  # LeRobot records no frame after the last action
+    has_action = rows["step_type"] != 2  # LeRobot records no frame after the last action
     for kind, camera in (("image", None), ("video", "observation.images.right")):
         shards = import_set("lerobot", str(work / f"theirs_{kind}"), work / f"back_{kind}", picture=camera)
         back = read_rows(shards[0])
-        change = np.abs(np.concatenate(list(read_frames(shards[0]))).astype(int) - rows["observation"][kept])
-        assert np.array_equal(back["reward"], rows["reward"][kept].astype(np.float32)), "rewards"
+        change = np.abs(np.concatenate(list(read_frames(shards[0]))).astype(int) - rows["observation"][has_action])
+        assert np.array_equal(back["reward"], rows["reward"][has_action].astype(np.float32)), "rewards"
         bound = np.concatenate([one["action"][1:] for one in episodes])
         low, high = bound.min(0), bound.max(0)
-        scaled = (rows["action"][kept] - low) / (high - low) * 2 - 1
+        scaled = (rows["action"][has_action] - low) / (high - low) * 2 - 1
         inner = back["step_type"] != 0
         assert np.allclose(back["action"][inner], scaled[inner], atol=1e-5), "actions"
         off = f"pixels off by {change.mean():.3f}, at most {change.max()}"
-        print(f"LeRobot's own {kind}, imported: {kept.sum()} rows, {off}")
+        print(f"LeRobot's own {kind}, imported: {has_action.sum()} rows, {off}")
 
 
 if __name__ == "__main__":

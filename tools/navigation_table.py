@@ -12,18 +12,27 @@ from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.files import groups
 from vd4rl_pomdp.runs.results import RUNS, read_results
-from vd4rl_pomdp.studies.navigation import measures
-from vd4rl_pomdp.studies.navigation.measures import OBJECTIVES, Condition, Measure, paper_number
-from vd4rl_pomdp.studies.navigation.report import Numbers
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_runs, numbers_of
+from vd4rl_pomdp.studies.navigation.runs import (
+    OBJECTIVES,
+    UNTRAINED,
+    Condition,
+    Measure,
+    NavigationRun,
+    Numbers,
+    load_runs,
+    numbers_of,
+    online_error,
+    paper_number,
+    refitted_error,
+)
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
-REFITTED = [measures.refitted_error(component) for component in ("state", "position", "velocity")]
+REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
 """Errors in percent, on held-out trajectories."""
-PAPERS_WAY = [measures.online_error(component).raw() for component in ("state", "position", "velocity")]
+PAPERS_WAY = [online_error(component).raw() for component in ("state", "position", "velocity")]
 """Errors with the paper's protocol and units."""
 REFERENCES = {
-    measures.UNTRAINED: "untrained",
+    UNTRAINED: "untrained",
     "supervised+a": "`supervised+a`",
     "supervised": "`supervised`",
     "supervised_picture": "`supervised_picture`",
@@ -46,12 +55,12 @@ def main_runs() -> list[NavigationRun]:
 def numbers_in(folder: str = ".") -> Numbers:
     """Numbers of the runs of results/navigation, or of a subfolder; empty if it has no runs."""
     place = RESULTS / folder
-    return numbers_of(frame_of(load_runs(read_results(place)))) if (place / RUNS).exists() else {}
+    return numbers_of(load_runs(read_results(place))) if (place / RUNS).exists() else {}
 
 
 def values(numbers: Numbers, condition: Condition, measure: Measure) -> list[float]:
     """One number per seed, in order."""
-    return list(numbers.get((*condition, *measure), {}).values())
+    return list(numbers.get((condition, measure), {}).values())
 
 
 def _mean(numbers: Numbers, condition: Condition, measure: Measure) -> str:
@@ -102,12 +111,12 @@ def state_lines(numbers: Numbers, settings: Iterable[tuple[str, Condition]]) -> 
     for words, setting in settings:
         for maze in filter(known, PAPER_MAZES):
             conditions = [setting._replace(maze=maze, method=name) for name in _ORDER]
-            for told, measure in ((words, PAPERS_WAY[0]), (f"{words}, in %", REFITTED[0])):
+            for name, measure in ((words, PAPERS_WAY[0]), (f"{words}, in %", REFITTED[0])):
                 counts = {len(values(numbers, condition, measure)) for condition in conditions} - {0}
                 if counts:
                     seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
                     cells = (_cell(numbers, condition, measure) for condition in conditions)
-                    rows.append((f"{maze.replace('_', ' ')}, {told}", seeds, *cells))
+                    rows.append((f"{maze.replace('_', ' ')}, {name}", seeds, *cells))
     return table_lines(("", "seeds", *(f"`{name}`" for name in _ORDER)), rows)
 
 
@@ -117,8 +126,9 @@ def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
     for method, k in (("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)):
         condition = Condition("three_curtains", method, k)
         seeds = ", ".join(str(len(values(numbers, condition, PAPERS_WAY[0]))) for numbers in (usual, longer))
-        told = (PAPERS_WAY[0], TRAINING_LOSS)
-        cells = (_cell(numbers, condition, one) for one in told for numbers in (usual, longer))
+        cells = (
+            _cell(numbers, condition, one) for one in (PAPERS_WAY[0], TRAINING_LOSS) for numbers in (usual, longer)
+        )
         rows.append((f"`{method}`, K = {k}", seeds, *cells))
     columns = (f"{words}, {steps} steps" for words in ("state error", "action loss") for steps in ("2,500", "20,000"))
     return table_lines(("", "seeds", *columns), rows)
@@ -126,16 +136,16 @@ def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
 
 def first_person_lines(numbers: Numbers) -> Iterator[str]:
     """Errors of everything trained under the compass, by increasing state error."""
-    told = {
+    conditions = {
         f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
         for name in OBJECTIVES
         for words in ("", " with self-prediction")
     } | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
-    state = {name: values(numbers, condition, REFITTED[0]) for name, condition in told.items()}
+    state = {name: values(numbers, condition, REFITTED[0]) for name, condition in conditions.items()}
     parts = (REFITTED, [one._replace(probe="online") for one in REFITTED[1:]])
     rows = []
-    for name in sorted(filter(state.get, told), key=lambda one: np.mean(state[one])):
-        cells = (", ".join(_cell(numbers, told[name], one) for one in part) for part in parts)
+    for name in sorted(filter(state.get, conditions), key=lambda one: np.mean(state[one])):
+        cells = (", ".join(_cell(numbers, conditions[name], one) for one in part) for part in parts)
         rows.append((name, len(state[name]), *cells))
     return table_lines(("", "seeds", "state, position, velocity", "probe beside the model: position, velocity"), rows)
 
@@ -157,7 +167,7 @@ def picture_lines(usual: Numbers) -> Iterator[str]:
     configs = [(result.record["config"], result) for result in read_results(RESULTS / "first_person" / "pictures")]
     changed = groups(configs, lambda one: PICTURES.get(one[0]["picture"]) or f"rate {one[0]['learning_rate']:g}")
     settings = {"the preset: grey, 50x50, rate 0.002": usual}
-    settings |= {words: numbers_of(frame_of(load_runs(run for _, run in runs))) for words, runs in changed.items()}
+    settings |= {words: numbers_of(load_runs(run for _, run in runs)) for words, runs in changed.items()}
     rows = (
         (words, *(_place_and_speed(numbers, Condition(STARS, name)) for name in methods))
         for words, numbers in settings.items()

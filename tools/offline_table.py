@@ -96,12 +96,12 @@ def return_lines(runs: Sequence[Run]) -> Iterator[str]:
     """Returns of the main methods, one row per dataset and corruption."""
     rows = []
     for place, corruption, here in _measured_sets(runs):
-        cells = [_told(_of(here, method, corruption)) for method in MAIN]
+        cells = [_mean_text(_of(here, method, corruption)) for method in MAIN]
         cells += [_less(here, corruption, "mik+a", "acro", clean) for clean in (False, True)]
         name = f"{SETS[place]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
-        rows.append((name + ", exploratory" * (place[1] in EXPLORATORY), *cells, _told(_of(here, "acro", CLEAN))))
-    shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
-    return table_lines(("set (data's return)", *shown, "`acro` trained with nothing hidden"), rows)
+        rows.append((name + ", exploratory" * (place[1] in EXPLORATORY), *cells, _mean_text(_of(here, "acro", CLEAN))))
+    head = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
+    return table_lines(("set (data's return)", *head, "`acro` trained with nothing hidden"), rows)
 
 
 def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -121,7 +121,7 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
     return table_lines(("set", "played", *CONTRASTS, "`mik+a` less the best other"), rows, (0, 1))
 
 
-def _told(runs: list[Run]) -> str:
+def _mean_text(runs: list[Run]) -> str:
     """Mean return with interval, and the number of seeds if below three; a dash if there is none."""
     if not runs:
         return number(None)
@@ -151,9 +151,9 @@ def _episodes(runs: list[Run], clean: bool) -> np.ndarray | None:
 
 def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
     """The report's statistics over datasets, for methods that all of them have."""
-    shown = [run for run in runs if run.labels["corruption"] in (HIDDEN, PATCHES) and run.method in MAIN]
+    main = [run for run in runs if run.labels["corruption"] in (HIDDEN, PATCHES) and run.method in MAIN]
     kinds = groups(
-        (run for run in shown if _place(run) in SETS),
+        (run for run in main if _place(run) in SETS),
         lambda run: (run.labels["quality"] in EXPLORATORY, run.labels["corruption"]),
     )
     rows = []
@@ -223,16 +223,18 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
     cells = {(run.method, run.labels["corruption"]): run for run in runs}
     returns = {place: returns_of([run]).item() for place, run in cells.items()}
 
-    def told(method: str, hidden: str) -> tuple[str, str]:
+    def cells_of(method: str, hidden: str) -> tuple[str, str]:
         run = cells.get((method, hidden))
         if run is None:
             return number(None), number(None)
         ends = [row["return"] for row in run.last]
-        shown = f"{returns[method, hidden]:.0f} ({min(ends):.0f} to {max(ends):.0f})"
-        return shown, ", ".join(number(run.measures[name], 1) for name in PROBES)
+        text = f"{returns[method, hidden]:.0f} ({min(ends):.0f} to {max(ends):.0f})"
+        return text, ", ".join(number(run.measures[name], 1) for name in PROBES)
 
     methods = list(dict.fromkeys(method for method, _ in cells))
     methods.sort(key=lambda method: [returns.get((method, hidden), -1.0) for hidden in CORRUPTIONS], reverse=True)
     columns = [f"{words} hidden: return (episodes)|probe: pose, velocity" for words in CORRUPTIONS.values()]
     head = ["", *(name for both in columns for name in both.split("|"))]
-    return table_lines(head, ((f"`{one}`", *(cell for h in CORRUPTIONS for cell in told(one, h))) for one in methods))
+    return table_lines(
+        head, ((f"`{one}`", *(cell for h in CORRUPTIONS for cell in cells_of(one, h))) for one in methods)
+    )

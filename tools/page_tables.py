@@ -8,13 +8,11 @@ A table follows a line `<!-- table: NAME -->` of its page. A test checks that th
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import ladder_table as ladder
 import navigation_table as mazes
 import offline_table as offline
-from script import run_script
 
 from vd4rl_pomdp.core.errors import UserError
 
@@ -23,11 +21,6 @@ MARK = "<!-- table: {} -->"
 """The line above a table."""
 Tables = dict[str, Iterable[str]]
 """Lines of tables by name."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """Write the tables made from committed rows into their pages. No options."""
 
 
 def pages() -> dict[str, Tables]:
@@ -59,7 +52,7 @@ def pages() -> dict[str, Tables]:
             "aggregate": offline.aggregate_lines(returns),
         },
     }
-    return {f"results/{place}/README.md": told for place, told in tables.items()}
+    return {f"results/{place}/README.md": of_page for place, of_page in tables.items()}
 
 
 def with_tables(text: str, tables: Tables, page: str) -> str:
@@ -80,7 +73,7 @@ def with_tables(text: str, tables: Tables, page: str) -> str:
     return "\n".join(lines)
 
 
-def main(config: Config) -> None:
+def main() -> None:
     """Write all pages, or none if a mark is missing."""
     found = [(ROOT / page, page, tables) for page, tables in pages().items()]
     written = {path: with_tables(path.read_text(encoding="utf-8"), tables, page) for path, page, tables in found}
@@ -89,4 +82,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_script(main, Config)
+    main()

@@ -29,7 +29,7 @@ def main() -> None:
     chance, ends = library.get_interval_estimates(
         {"x": both}, metrics.probability_of_improvement, reps=REPLICATES // 10
     )
-    told = {
+    results = {
         "rliable": "1.2.0",
         "replicates": REPLICATES,
         "thresholds": THRESHOLDS.tolist(),
@@ -37,7 +37,7 @@ def main() -> None:
         "statistics": {name: _statistics(values) for name, values in scores.items()},
         "improvement": [float(chance["x"]), *map(float, ends["x"].ravel())],
     }
-    print(json.dumps(told))
+    print(json.dumps(results))
 
 
 def _statistics(scores: np.ndarray) -> dict[str, list[float]]:

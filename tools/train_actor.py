@@ -17,7 +17,7 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import export_actor as exporting
 import jax
@@ -36,7 +36,7 @@ from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import TASKS, Task
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
-from vd4rl_pomdp.runs.files import write_bytes
+from vd4rl_pomdp.runs.files import jsonable, write_bytes
 
 CHECKPOINT = "checkpoint.safetensors"
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -60,12 +60,10 @@ class PolicyConfig:
     """Seed of the networks, the replay sampling and the training episodes."""
     learning_rate: float = 7e-4
     """Adam's learning rate for actor and critics."""
-    network: Literal["mlp", "simba"] = "mlp"
-    """mlp: two hidden layers; simba: one residual block with layer norms (arXiv 2410.09754)."""
     hidden: int = 256
-    """Hidden units, or width of the residual stream."""
+    """Units of each of two hidden layers."""
     critic_norm: bool = False
-    """Layer norm after each hidden layer of an mlp's critics."""
+    """Layer norm after each hidden layer of the critics."""
     normalise: bool = False
     """Standardise observations by running statistics."""
     n_step: int = 1
@@ -124,9 +122,8 @@ def build(config: PolicyConfig, task: Task) -> SAC:
     """A new learner; its environments standardise observations if the config says so."""
     envs = DummyVecEnv([lambda: StateEnv(task)] * config.envs)
     rounds = max(1, DECISIONS_A_ROUND // config.envs)
-    network = {"net_arch": [config.hidden] if config.network == "simba" else [config.hidden, config.hidden]}
     model = SAC(
-        "SimbaPolicy" if config.network == "simba" else "MlpPolicy",
+        "MlpPolicy",
         VecNormalize(envs, norm_obs=config.normalise, norm_reward=False, clip_obs=OBSERVATION_CLIP),
         learning_rate=config.learning_rate,
         qf_learning_rate=config.learning_rate,
@@ -138,7 +135,7 @@ def build(config: PolicyConfig, task: Task) -> SAC:
         n_steps=config.n_step,
         ent_coef=f"auto_{config.temperature}",
         target_entropy=config.target_entropy * layout_of(task).action_dim,
-        policy_kwargs=network | ({"layer_norm": True} if config.critic_norm else {}),
+        policy_kwargs={"net_arch": [config.hidden, config.hidden], "layer_norm": config.critic_norm},
         seed=config.seed,
     )
     model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
@@ -151,18 +148,10 @@ def build(config: PolicyConfig, task: Task) -> SAC:
 def export_actor(model: SAC, config: PolicyConfig, decisions: int) -> Actor:
     """The learner's policy as an `Actor`."""
     params = model.policy.actor_state.params["params"]
-    if config.network == "simba":
-        layers = {"embed": params["Dense_0"], "norm": params["LayerNorm_0"]}
-        layers |= {"mean": params["Dense_1"], "log_std": params["Dense_2"]}
-        for i in range(sum(name.startswith("SimbaResidualBlock") for name in params)):
-            block = params[f"SimbaResidualBlock_{i}"]
-            layers |= {f"block.{i}.norm": block["LayerNorm_0"], f"block.{i}.up": block["Dense_0"]}
-            layers[f"block.{i}.down"] = block["Dense_1"]
-    else:
-        names = [*(f"hidden.{i}" for i in range(len(params) - 2)), "mean", "log_std"]
-        layers = {name: params[f"Dense_{i}"] for i, name in enumerate(names)}
-    ours = {"kernel": "weight", "scale": "scale", "bias": "bias"}
-    weights = {f"{name}.{ours[kind]}": value for name, layer in layers.items() for kind, value in layer.items()}
+    names = [*(f"hidden.{i}" for i in range(len(params) - 2)), "mean", "log_std"]
+    weights: dict[str, Any] = {}
+    for i, name in enumerate(names):
+        weights |= {f"{name}.weight": params[f"Dense_{i}"]["kernel"], f"{name}.bias": params[f"Dense_{i}"]["bias"]}
     if config.normalise:
         envs = model.get_vec_normalize_env()
         weights["observation.mean"] = envs.obs_rms.mean
@@ -190,7 +179,7 @@ def _restored(model: SAC, states: Any, path: Path) -> tuple[Any, dict[str, np.nd
     leaves, structure = jax.tree_util.tree_flatten(states)
     found = [stored.get(f"{i:04d}", np.empty(0)) for i in range(len(leaves))]
     if any(one.shape != np.shape(leaf) for one, leaf in zip(found, leaves, strict=True)):
-        raise UserError(f"{path}: holds networks of another shape; use the --network and --hidden they were made with")
+        raise UserError(f"{path}: holds networks of another shape; use the --hidden they were made with")
     cast = [jax.numpy.asarray(one.astype(np.asarray(leaf).dtype)) for one, leaf in zip(found, leaves, strict=True)]
     rms: Any = model.get_vec_normalize_env()
     for name in STATISTICS if rms.norm_obs else ():
@@ -284,12 +273,11 @@ def train_actor(config: PolicyConfig) -> dict[str, Path]:
 
 def _begin(config: PolicyConfig) -> None:
     """Write a new run's settings, or reject settings that differ from an existing run's. Its length may change."""
-    kept = {k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")}
-    kept["start_from"] = None if config.start_from is None else str(config.start_from)
+    settings = jsonable({k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")})
     path = config.out / exporting.SETTINGS
     if path.exists():
         stored = json.loads(path.read_text(encoding="utf-8"))
-        if differing := [name for name, value in kept.items() if stored.get(name) != value]:
+        if differing := [name for name, value in settings.items() if stored.get(name) != value]:
             raise UserError(f"{config.out}: holds a run that differs in {', '.join(differing)}; choose another --out")
         return
     if config.out.exists() and any(config.out.iterdir()):
@@ -297,7 +285,7 @@ def _begin(config: PolicyConfig) -> None:
     if config.start_from is not None and not all((config.start_from / name).exists() for name in exporting.PROGRESS):
         raise UserError(f"{config.start_from}: lacks one of {', '.join(exporting.PROGRESS)}; name the folder of a run")
     config.out.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, (json.dumps(kept, indent=1) + "\n").encode())
+    write_bytes(path, (json.dumps(settings, indent=1) + "\n").encode())
 
 
 def _start_from(model: SAC, config: PolicyConfig, start: Path) -> list[tuple[int, float]]:

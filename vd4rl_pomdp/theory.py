@@ -3,6 +3,6 @@
 import sys
 
 from vd4rl_pomdp.studies import theory
-from vd4rl_pomdp.studies.theory import classifiers, views
+from vd4rl_pomdp.studies.theory import classifiers
 
-sys.modules |= {__name__: theory, f"{__name__}.classifiers": classifiers, f"{__name__}.views": views}
+sys.modules |= {__name__: theory, f"{__name__}.classifiers": classifiers, f"{__name__}.views": classifiers}

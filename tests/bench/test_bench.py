@@ -9,15 +9,20 @@ from vd4rl_pomdp.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
 
-def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch):
+def test_every_section_measures_what_its_goals_are_about(tmp_path, monkeypatch):
     dataset, opening = suite.synthetic_set(tmp_path, 8)
+    assert opening["rows"] == dataset.num_rows == 8 * suite.EPISODE_ROWS
     sections = {"opening": opening, "sampling": suite.sampling(dataset, 5)}
     monkeypatch.setattr(suite, "BATCH", 4)
-    sections["finetuning"] = suite.finetuning(dataset, 1)
+    sections |= {"finetuning": suite.finetuning(dataset, 1), "stacking": suite.stacking(dataset, 1)}
+    sections |= {"methods": suite.methods(dataset, tmp_path, 1), "memories": suite.memories(dataset, tmp_path, 1)}
+    sections["sharing"] = processes.sharing(0.05, rounds=1)
     measured = flatten(sections)
-    assert opening["rows"] == dataset.num_rows == 8 * suite.EPISODE_ROWS
     assert all(value > 0 for value in measured.values())
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
+    trained = {name for name, method in METHODS.items() if method.trained}
+    told_states = {"supervised", "supervised+a", "supervised_picture", "integrator"}
+    assert sections["methods"].keys() - {"k_30_over_k_15", "half_over_whole_resolution"} == trained - told_states
 
 
 def test_drawing_is_measured_over_more_frames_than_an_episode_has(monkeypatch):
@@ -29,30 +34,10 @@ def test_drawing_is_measured_over_more_frames_than_an_episode_has(monkeypatch):
         return env
 
     monkeypatch.setattr(suite, "make_env", short)
-    assert suite._render_wall(("fast", 5)) > 0
-
-
-def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
-    dataset, _ = suite.synthetic_set(tmp_path, 2)
-    measured = suite.methods(dataset, tmp_path, 1)
-    ratios = {"k_30_over_k_15", "half_over_whole_resolution"}
-    assert measured.keys() - ratios == {name for name, method in METHODS.items() if method.trained} - {
-        *("supervised", "supervised+a", "supervised_picture", "integrator"),
-    }
-    assert all(value > 0 for value in flatten(measured).values())
-
-
-def test_every_memory_is_measured_against_the_gru(tmp_path):
-    dataset, _ = suite.synthetic_set(tmp_path, 2)
-    measured = suite.memories(dataset, tmp_path, 1)
-    assert {f"memories.{name}" for name in measured} == {name for name in GOALS if name.startswith("memories.")}
-    assert all(value > 0 for value in measured.values())
+    assert suite._render_wall(5) > 0
 
 
 def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
-    measured = flatten({"sharing": processes.sharing(0.05, rounds=1)})
-    assert all(value > 0 for value in measured.values())
-    assert {name for name in GOALS if name.startswith("sharing.")} <= set(measured)
     speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "ACTIVE"): [125.0]}
 
     def apart(function, seconds, count=1, OMP_WAIT_POLICY=""):
@@ -63,30 +48,21 @@ def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
 
 
 def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
-    seen, small = {}, partial(suite.synthetic_set, episodes=1)
-
-    def section(name):
-        return lambda dataset, *_: seen.setdefault(name, {"device": dataset.t.device.type})
-
+    small = partial(suite.synthetic_set, episodes=1)
     named = ("sampling", "pretraining", "finetuning", "methods", "memories")
-    monkeypatch.setattr(suite, "against_jax", lambda *_: {})
-    monkeypatch.setattr(suite, "stacking", lambda *_: {})
-    for name in named:
-        monkeypatch.setattr(suite, name, section(name))
-    for name in ("memory", "collection", "sharing", "maze_pictures", "maze_training"):
+    for name in ("against_jax", "stacking", "memory", "collection", "sharing", "maze_pictures", "maze_training"):
         monkeypatch.setattr(suite, name, lambda *_: {})
+    for name in named:
+        monkeypatch.setattr(suite, name, lambda dataset, *_: {"device": dataset.t.device.type})
     monkeypatch.setattr(suite, "synthetic_set", lambda folder, _: small(folder))
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
     results = suite.bench()
     assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 4]
 
 
-def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):
+def test_policies_are_measured_against_jax(tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "BATCH", 4)
     dataset, _ = suite.synthetic_set(tmp_path, 1)
-    stacked = suite.stacking(dataset, 1)
-    assert all(value > 0 for value in stacked.values())
-
     monkeypatch.setattr(suite, "apart", lambda *_: [{"ms": 1.0, "device": "cpu"}])
     monkeypatch.setattr(suite.importlib.util, "find_spec", lambda _: True)
     told = suite.against_jax(dataset, 1, (16,))

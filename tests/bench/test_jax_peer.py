@@ -50,15 +50,3 @@ def test_the_peer_in_jax_makes_the_same_updates():
         for (weight, bias), (w, b) in zip(theirs, jax_peer.net(mine), strict=True):
             assert float(abs(weight - w).max()) < 1e-5
             assert float(abs(bias - b).max()) < 1e-5
-
-
-def test_the_peer_draws_every_number_anew():
-    from vd4rl_pomdp.bench import jax_peer
-
-    empty = jax.numpy.zeros
-    table = jax_peer.Table(*map(empty, [(2, 9, 4), (2, 7), (2, 7), (7, 3), (7,), (7,), (4,), (4,)]))
-    drawn = jax_peer.draw(jax.random.key(0), table, 6, 50)
-    assert (drawn.transition.shape, drawn.view.shape, drawn.noise.shape) == ((6, 50), (6, 50), (6, 50, 3))
-    assert set(drawn.transition.ravel().tolist()) == set(range(7))
-    assert set(drawn.view.ravel().tolist()) == {0, 1}
-    assert len(set(drawn.noise.ravel().tolist())) == drawn.noise.size

@@ -7,11 +7,11 @@ from tests.studies.navigation.test_report import write_run
 from vd4rl_pomdp.agents import shipped
 from vd4rl_pomdp.cli import demo as demos
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.cli.demo import PAIR, conclusion, demo_jobs, show_navigation
+from vd4rl_pomdp.cli.demo import PAIR, demo_jobs
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import write_json
-from vd4rl_pomdp.studies.navigation.measures import Condition
+from vd4rl_pomdp.studies.navigation.runs import Condition
 
 METHODS = ("mik+a", "acro", "random")
 LABELS = {"task": "walker_walk", "quality": "expert_noisy", "corruption": "patch+zero_frames"}
@@ -76,8 +76,14 @@ def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_pat
     shown = capsys.readouterr()
     told = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
     assert Counter(told) == {"data": 1, "pretrain": 3, "finetune": 3, "navigation": 3, "report": 1}
-    assert all(f"  {method} " in shown.out for method in METHODS)
-    assert (tmp_path / "demo/navigation.gif").is_file()
+    out = [" ".join(line.split()) for line in shown.out.splitlines()]
+    start = next(number for number, line in enumerate(out) if line.startswith(f"Under {LABELS['corruption']}, what"))
+    lines = [f"{method} 39, 54 120 ± 20 (n = 2)" for method in METHODS]
+    assert out[start + 3 : start + 6] == lines, "of the last evaluation, and how sure it is"
+    assert out[start + 6].startswith("One seed each")
+    assert {"mik+a 7", "no_history 80"} <= set(out), "errors behind the curtains"
+    with Image.open(tmp_path / "demo" / "navigation.gif") as film:
+        assert film.n_frames == 60
 
 
 def test_without_a_gpu_the_demo_does_a_job_a_core_up_to_four(tmp_path, monkeypatch):
@@ -95,22 +101,3 @@ def test_without_a_gpu_the_demo_does_a_job_a_core_up_to_four(tmp_path, monkeypat
         with pytest.raises(SystemExit, match="2"):
             main(["demo", "--out", str(tmp_path)])
     assert at_once == [2, 4, 0]
-
-
-def test_the_demo_ends_with_the_last_evaluation_what_is_known_and_how_sure_it_is(tmp_path):
-    jobs = demo_jobs(tmp_path)
-    write_returns(jobs)
-    head, _, _, *lines, caveat, _ = conclusion(jobs)
-    assert LABELS["corruption"] in head
-    assert [" ".join(line.split()) for line in lines] == [f"{method} 39, 54 120 ± 20 (n = 2)" for method in METHODS]
-    assert "One seed each" in caveat
-
-
-def test_the_demo_ends_with_a_film_and_the_errors_behind_the_curtains(tmp_path):
-    jobs = demo_jobs(tmp_path)
-    write_navigation(jobs)
-    lines = list(show_navigation(jobs, tmp_path / "film.gif"))
-    assert [line.split() for line in lines[1:3]] == [["mik+a", "7"], ["no_history", "80"]]
-    assert "film.gif" in lines[-1]
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames == 60

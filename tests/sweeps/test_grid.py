@@ -7,7 +7,7 @@ import pytest
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
-from vd4rl_pomdp.studies.navigation.measures import condition_of, paper_rows
+from vd4rl_pomdp.studies.navigation.runs import condition_of, paper_rows
 from vd4rl_pomdp.sweeps.grid import load_grid, names, narrow
 from vd4rl_pomdp.sweeps.stages import check_cells, collection_of, recipe_of, recorded
 

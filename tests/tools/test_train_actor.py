@@ -23,10 +23,7 @@ AT_LEAST = {
 }
 PLAYED = 8
 """Episodes of a card that are played again."""
-SETTINGS = {
-    "mlp": {"critic_norm": True, "n_step": 3, "envs": 2, "updates_per_decision": 0.5},
-    "simba": {"network": "simba", "learning_rate": 1e-3},
-}
+SETTINGS = {"critic_norm": True, "n_step": 3, "envs": 2, "updates_per_decision": 0.5}
 
 
 @pytest.fixture
@@ -70,9 +67,8 @@ def test_an_actor_returns_what_its_card_says(exporting, name):
     assert found.mean() == pytest.approx(said.mean(), rel=0.02)
 
 
-@pytest.mark.parametrize("kind", SETTINGS)
-def test_an_exported_actor_acts_like_the_learners_network(training, configure, kind, tmp_path):
-    config = configure(tmp_path, **SETTINGS[kind])
+def test_an_exported_actor_acts_like_the_learners_network(training, configure, tmp_path):
+    config = configure(tmp_path, **SETTINGS)
     model = training.build(config, TASKS.named("walker_walk"))
     model.learn(120)
     assert model._n_updates > 0
@@ -90,7 +86,7 @@ def leaves(tree):
 
 
 def test_a_run_is_resumed_from_all_it_had_and_another_starts_from_its_export(training, exporting, configure, tmp_path):
-    config = configure(tmp_path / "run", decisions=80, **SETTINGS["mlp"])
+    config = configure(tmp_path / "run", decisions=80, **SETTINGS)
     files = training.train_actor(config)
     names = {f"walker_walk_{quality}.safetensors" for quality in ("expert", "medium", "replay")}
     assert {path.name for path in files.values()} == names
@@ -114,7 +110,7 @@ def test_a_run_is_resumed_from_all_it_had_and_another_starts_from_its_export(tra
 
     kept = tmp_path / "kept"
     exporting.export_run(config.out, kept)  # what a repository would hold
-    new = configure(tmp_path / "new", decisions=180, start_from=kept, **SETTINGS["mlp"])
+    new = configure(tmp_path / "new", decisions=180, start_from=kept, **SETTINGS)
     training.train_actor(new)
     assert [step for step, _ in exporting.read_curve(new.out)] == [40, 80, 120, 180]
     for step in (40, 80):
@@ -123,7 +119,7 @@ def test_a_run_is_resumed_from_all_it_had_and_another_starts_from_its_export(tra
 
 
 def test_a_refill_trains_the_critics_and_leaves_the_actor(training, configure, tmp_path):
-    config = configure(tmp_path, **SETTINGS["mlp"])
+    config = configure(tmp_path, **SETTINGS)
     model = training.build(config, TASKS.named("walker_walk"))
     before, critics = training.export_actor(model, config, 0), leaves(model.policy.qf_state.params)
     model._setup_learn(0)

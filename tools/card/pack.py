@@ -88,11 +88,11 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--has", type=Path, help="pip freeze of the machine")
     parser.add_argument("--python", default="3.12", help="the machine's Python")
-    told = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / NAME
         site = folder / "site"
-        install(wanted(told.has.read_text().splitlines() if told.has else []), told.python, site)
+        install(wanted(args.has.read_text().splitlines() if args.has else []), args.python, site)
         for pattern in DROPPED:
             for path in list(site.glob(pattern)):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -103,9 +103,9 @@ def main() -> None:
         for path in (HERE / "run.py", ROOT / "pyproject.toml", *HERE.glob("*.toml")):
             shutil.copy(path, folder)
         shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
-        with tarfile.open(told.out, "w:xz") as file:
+        with tarfile.open(args.out, "w:xz") as file:
             file.add(folder, NAME)
-    print(f"{told.out.stat().st_size / 1e6:7.1f} MB  {told.out}")
+    print(f"{args.out.stat().st_size / 1e6:7.1f} MB  {args.out}")
 
 
 if __name__ == "__main__":

@@ -111,29 +111,29 @@ class Session:
         """Log the machine and its torch version."""
         found = "from torch import __version__, cuda"
         found += "; print(__version__, *map(cuda.get_device_name, range(cuda.device_count())))"
-        code, told = self.run([sys.executable, "-c", found], 90, quiet=True)
-        self.gpu = len(told.split()) > 1
-        self.say(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, torch {told.strip()} ({code})")
+        code, output = self.run([sys.executable, "-c", found], 90, quiet=True)
+        self.gpu = len(output.split()) > 1
+        self.say(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, torch {output.strip()} ({code})")
 
     def find_renderer(self) -> None:
         """Choose an environment that renders a frame, with the GPU if possible: the machine's own, or with packed
         libraries."""
         files = [str(file) for folder in VENDORS for file in Path(folder).glob("egl_vendor.d/*nvidia*.json")]
         folders = filter(None, [str(HERE / "opengl"), os.environ.get("LD_LIBRARY_PATH")])
-        own = {"LD_LIBRARY_PATH": os.pathsep.join(folders)}
+        packed = {"LD_LIBRARY_PATH": os.pathsep.join(folders)}
         vendor = {"__EGL_VENDOR_LIBRARY_FILENAMES": files[0]} if files else {}
-        before, found, told = dict(self.env), None, ""
-        for more in ({}, own, vendor, own | vendor):
+        before, found, output = dict(self.env), None, ""
+        for more in ({}, packed, vendor, packed | vendor):
             self.env = before | more
-            code, told = self.run([sys.executable, "-P", "-c", DRAWS], 60, quiet=True)
-            if code == 0 and (found is None or "NVIDIA" in told):
+            code, output = self.run([sys.executable, "-P", "-c", DRAWS], 60, quiet=True)
+            if code == 0 and (found is None or "NVIDIA" in output):
                 found = more
-                self.say(f"drawn by {told.strip().splitlines()[-1]} {more or ''}")
-            if found is not None and ("NVIDIA" in told or not self.gpu):
+                self.say(f"drawn by {output.strip().splitlines()[-1]} {more or ''}")
+            if found is not None and ("NVIDIA" in output or not self.gpu):
                 break
         self.env = before | (found or {})
         if found is None:
-            self.say(f"nothing draws here: {told.strip()[-500:]}")
+            self.say(f"nothing draws here: {output.strip()[-500:]}")
 
 
 def collect(session: Session, sweep: list[str], until: float) -> int:
@@ -146,8 +146,8 @@ def collect(session: Session, sweep: list[str], until: float) -> int:
     for line in plan.splitlines():
         command = shlex.split(line, comments=True)[1:]
         if code == 0 and command[:2] == ["data", "collect"]:
-            code, told = session.run([*PROGRAM, *command], until - time.monotonic(), quiet=True)
-            session.say(f"{command[-1]}: {told if code else 'collected'}")
+            code, output = session.run([*PROGRAM, *command], until - time.monotonic(), quiet=True)
+            session.say(f"{command[-1]}: {output if code else 'collected'}")
     return code
 
 
@@ -169,8 +169,10 @@ def bring_home(session: Session, runs: Path, out: Path, mib: float) -> None:
     folders = [path.parent for path in runs.rglob("config.json") if path.parent.name != "encoder"]
     stages = {folder: json.loads((folder / "config.json").read_text()).get("stage", "") for folder in folders}
     if any((folder / "timing.json").exists() for folder in folders):
-        code, told = session.run([*PROGRAM, "results", "add", str(runs), "--out", str(out / "results")], 60, quiet=True)
-        session.say(f"rows: {told.strip()} ({code})")
+        code, output = session.run(
+            [*PROGRAM, "results", "add", str(runs), "--out", str(out / "results")], 60, quiet=True
+        )
+        session.say(f"rows: {output.strip()} ({code})")
     with tarfile.open(out / "records.tar.xz", "w:xz", preset=3) as file:
         for path in sorted(runs.rglob("*")):
             if path.suffix in (".json", ".jsonl", ".csv", ".log") and path.is_file():
@@ -203,23 +205,23 @@ def main() -> None:
     parser.add_argument("--bring", type=float, default=0, metavar="MIB", help="encoders, up to this size in all")
     words = sys.argv[1:]
     at = words.index("--") if "--" in words else len(words)
-    told, flags = parser.parse_args(words[:at]), words[at + 1 :]
+    args, flags = parser.parse_args(words[:at]), words[at + 1 :]
 
-    session = Session(told.out, told.seconds)
+    session = Session(args.out, args.seconds)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    told.work.mkdir(parents=True, exist_ok=True)
-    done = told.home and (told.home / "results").is_dir()
-    if told.home and (parts := sorted(told.home.glob("encoders.tar.*"))):  # to where the sweep finds them
+    args.work.mkdir(parents=True, exist_ok=True)
+    done = args.home and (args.home / "results").is_dir()
+    if args.home and (parts := sorted(args.home.glob("encoders.tar.*"))):  # to where the sweep finds them
         with tarfile.open(fileobj=io.BytesIO(b"".join(part.read_bytes() for part in parts))) as file:
-            file.extractall(told.work / "runs", filter="data")
-    if done and told.home.resolve() != told.out.resolve():
-        shutil.copytree(told.home / "results", told.out / "results", dirs_exist_ok=True)
+            file.extractall(args.work / "runs", filter="data")
+    if done and args.home.resolve() != args.out.resolve():
+        shutil.copytree(args.home / "results", args.out / "results", dirs_exist_ok=True)
     session.describe()
     session.find_renderer()
     try:
-        parts = [(name, float(limit or "inf")) for name, _, limit in (part.partition("=") for part in told.parts)]
-        words = ["--out", str(told.work / "runs"), "--data", str(told.work / "data"), *flags]
-        words += ["--done", str(told.home / "results")] if done else []
+        parts = [(name, float(limit or "inf")) for name, _, limit in (part.partition("=") for part in args.parts)]
+        words = ["--out", str(args.work / "runs"), "--data", str(args.work / "data"), *flags]
+        words += ["--done", str(args.home / "results")] if done else []
         files = {name: HERE / name for name, _ in parts if name not in ("tests", "bench")}
         grids = {name: str(file) if file.is_file() else name for name, file in files.items()}
         sweeps = {name: [*PROGRAM, "sweep", "run", grid, *words] for name, grid in grids.items()}
@@ -238,7 +240,7 @@ def main() -> None:
     finally:
         for process in session.processes:
             process.terminate()
-        bring_home(session, told.work / "runs", told.out, told.bring)
+        bring_home(session, args.work / "runs", args.out, args.bring)
         session.say("done")
 
 

@@ -94,18 +94,8 @@ TINY = Size(1, 16, 8, 2, 1, 1, 2, 1, 1, 3, 2, "nature", 16)
 
 
 def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
-    """Run all measurements.
-
-    Args:
-        device_name: a GPU; with `quick` also a CPU.
-        quick: tiny sizes that only test the code.
-
-    Returns:
-        Nested times, ratios and peak memory, with machine, commit and versions.
-
-    Raises:
-        UserError: no GPU is visible, and `quick` is not set.
-    """
+    """All times, ratios and peak memory, with machine, commit and versions; UserError without a GPU, unless `quick`,
+    whose tiny sizes only test the code."""
     device = pick_device(device_name)
     if device.type != "cuda" and not quick:
         raise UserError("bench --gpu measures a GPU, and none is visible: on a CPU, try the code with --quick")
@@ -146,12 +136,8 @@ def measured(make: Callable[[], Callable[[], Any]], device: torch.device, steps:
     with patch.dict(os.environ, {EAGER_VARIABLE: "1"}):  # disables CUDA graphs
         slow = milliseconds(make(), device, max(1, steps // 4), max(1, blocks // 2))
     free(device)
-    step = make()
-    fast = milliseconds(step, device, steps, blocks)
-    told = {"eager_ms": slow, "replayed_ms": fast, "eager_over_replayed": slow / fast} | peak(device)
-    del step
-    free(device)
-    return told
+    fast = milliseconds(make(), device, steps, blocks)
+    return {"eager_ms": slow, "replayed_ms": fast, "eager_over_replayed": slow / fast} | peak(device)
 
 
 def milliseconds(step: Callable[[], Any], device: torch.device, steps: int, blocks: int) -> float:
@@ -226,14 +212,8 @@ def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Ten
     config = finetuning("drqv2_bc", size)
     encoder = Encoder(EncoderConfig(dataset.action_dim)).to(dataset.t.device)
     view = View(dataset, CorruptionConfig.of(CORRUPTION), config.shift, 0, STAGE)
-    return next_update(
-        config,
-        dataset,
-        encoder.dim,
-        lambda draws: TransitionSampler(view, config.batch_size, draws, 3, 0.99),
-        1,
-        encoder,
-    )
+    batches = partial(TransitionSampler, view, config.batch_size, n_step=3, gamma=0.99)
+    return next_update(config, dataset, encoder.dim, batches, 1, encoder)
 
 
 def finetuning(algorithm: str, size: Size) -> FinetuneConfig:
@@ -259,13 +239,13 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
                 update()
 
     in_one = milliseconds(step, device, size.steps, size.blocks) / size.runs
-    told = {"at_once": size.runs, "on_streams_ms": in_one} | peak(device)
+    measured = {"at_once": size.runs, "on_streams_ms": in_one} | peak(device)
     updates.clear()
     free(device)
     given = str(folder), str(device), asdict(size), 4.0 if size is PAPER else 0.1
     answers = apart(f"{__name__}.pretraining_steps", *given, count=size.runs)
     in_processes = 1e3 / sum(answer["steps_per_s"] for answer in answers)
-    return told | {"in_processes_ms": in_processes, "each_ms": min(in_one, in_processes)}
+    return measured | {"in_processes_ms": in_processes, "each_ms": min(in_one, in_processes)}
 
 
 def pretraining_steps(folder: str, device: str, size: dict[str, Any], seconds: float) -> Callable[[], dict[str, Any]]:
@@ -291,14 +271,8 @@ def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: floa
     """The same update in JAX; a ratio only if JAX sees this GPU."""
     if importlib.util.find_spec("optax") is None:
         return {"jax": JAX_MISSING}
-    shape = {
-        "hidden_dim": size.hidden_dim,
-        "batch_size": size.batch_size,
-        "dim": features.shape[-1],
-        "action_dim": dataset.action_dim,
-        "views": len(features),
-        "rows": dataset.num_rows,
-    }
+    shape = {"hidden_dim": size.hidden_dim, "batch_size": size.batch_size, "dim": features.shape[-1]}
+    shape |= {"action_dim": dataset.action_dim, "views": len(features), "rows": dataset.num_rows}
     given = "vd4rl_pomdp.bench.processes.jax_updates", shape, size.updates, size.blocks
     # by default JAX preallocates three quarters of the GPU's memory
     ((exact,), (tf32,)) = (apart(*given, words, XLA_PYTHON_CLIENT_PREALLOCATE="false") for words in (False, True))
@@ -310,9 +284,8 @@ def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: floa
 def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size) -> dict[str, Any]:
     """Seconds for an evaluation on all cores."""
     corruption = CorruptionConfig.of(CORRUPTION)
-    save_encoder(
-        folder / "encoder", encoder, EncoderCard("mik+a", "walker_walk", "bench", flat(corruption), 0, 0, "paper")
-    )
+    card = EncoderCard("mik+a", "walker_walk", "bench", flat(corruption), 0, 0, "paper")
+    save_encoder(folder / "encoder", encoder, card)
     Policy(encoder.dim, dataset.action_dim, size.hidden_dim).save(folder / "policy")
     jobs = jobs_of(folder, TASKS.named("walker_walk"), [corruption], size.played, size.decisions)
     start = time.perf_counter()

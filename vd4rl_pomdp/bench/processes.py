@@ -37,16 +37,10 @@ _SERVE = "from vd4rl_pomdp.bench.processes import serve; serve()"
 
 
 def apart(function: str, *arguments: Any, count: int = 1, **environment: str) -> list[dict[str, Any]]:
-    """Run a measurement in fresh processes, all at the same time once every one is ready.
+    """Run a measurement in `count` fresh processes, all at the same time once every one is ready.
 
-    Args:
-        function: "module.name" of a function that prepares the measurement and returns a function returning a dict.
-        arguments: its arguments, JSON-serialisable.
-        count: number of processes.
-        environment: environment variables of the processes.
-
-    Raises:
-        WorkerDiedError: a process ended without an answer.
+    `function` is the "module.name" of one that prepares the measurement from JSON-serialisable arguments and returns a
+    function returning a dict. WorkerDiedError if a process ends without an answer.
     """
     words = [sys.executable, "-c", _SERVE, json.dumps([function, *arguments])]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -88,10 +82,7 @@ def touch(frames: torch.Tensor) -> None:
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
     """Peak memory of a process that trains on the dataset in `folder`, and what a second one adds beyond the shared
-    frames.
-
-        Empty where /proc is missing.
-    """
+    frames; empty where /proc is missing."""
     if not _STATUS.exists():
         return {}
     peak, private = next(iter(run_jobs(_train_a_little, [folder, folder], 2)))
@@ -115,15 +106,10 @@ def _train_a_little(folder: Path) -> list[int]:
 
 def sharing(seconds: float, rounds: int = 3) -> dict[str, float]:
     """Updates/s of a single run; ratio of the slower of two concurrent runs to it, and of it to one that waits
-    actively.
-
-    Args:
-        seconds: training time per process.
-        rounds: alternating repetitions; medians count.
-    """
+    actively. Medians over alternating rounds."""
 
     def slowest(**how: Any) -> float:
-        return min(told["updates_per_s"] for told in apart(f"{__name__}.training", seconds, **how))
+        return min(answer["updates_per_s"] for answer in apart(f"{__name__}.training", seconds, **how))
 
     speeds = [(slowest(), slowest(count=2), slowest(OMP_WAIT_POLICY="ACTIVE")) for _ in range(rounds)]
     alone, together, active = (statistics.median(column) for column in zip(*speeds, strict=True))
@@ -159,11 +145,8 @@ def _td3_bc(config: FinetuneConfig, dim: int, action_dim: int) -> TD3BC:
 def jax_updates(shape: dict[str, int], updates: int, blocks: int, tf32: bool = False) -> Callable[[], dict[str, Any]]:
     """TD3+BC in JAX on random features (see `jax_peer`), on JAX's default device: median milliseconds per update.
 
-    Args:
-        shape: `hidden_dim`, `batch_size`, `dim`, `action_dim`, `views`, `rows`.
-        updates: updates per call; even.
-        blocks: calls, over which the median is taken.
-        tf32: on a GPU, TF32 matrix products (JAX's default) instead of float32 (PyTorch's).
+    An even number of updates per call, `blocks` calls. With `tf32`, a GPU's matrix products are in TF32 (JAX's default)
+    instead of float32 (PyTorch's).
     """
     import jax  # an optional dependency
 
@@ -174,9 +157,9 @@ def jax_updates(shape: dict[str, int], updates: int, blocks: int, tf32: bool = F
     algorithm = _td3_bc(FinetuneConfig.of("paper", hidden_dim=shape["hidden_dim"]), dim, actions)
     first = torch.arange(rows - 3).expand(shape["views"], -1)
     features = torch.randn(shape["views"], rows, dim).half()
-    told = torch.rand(rows - 3, actions), torch.rand(rows - 3), torch.ones(rows - 3)
+    transitions = torch.rand(rows - 3, actions), torch.rand(rows - 3), torch.ones(rows - 3)
     scale = algorithm.policy.standardise.mean, algorithm.policy.standardise.std
-    table = jax_peer.Table(*map(jax_peer.as_jax, (features, first, first + 3, *told, *scale)))
+    table = jax_peer.Table(*map(jax_peer.as_jax, (features, first, first + 3, *transitions, *scale)))
     learnt, key = jax_peer.learnt_by(algorithm), jax.random.key(0)
     make = jax_peer.make_updates(algorithm)
 

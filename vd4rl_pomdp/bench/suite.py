@@ -51,7 +51,7 @@ from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.data import MazeData
+from vd4rl_pomdp.studies.navigation.train import MazeData
 from vd4rl_pomdp.studies.navigation.train import make_trainer as make_maze_trainer
 
 GOALS: dict[str, tuple[str, float]] = {
@@ -96,30 +96,23 @@ HISTORY_WINDOW = 32
 
 
 def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
-    """Run all measurements.
-
-    Args:
-        quick: smaller dataset and fewer repetitions.
-        device: training device.
-
-    Returns:
-        Nested ratios and rates, with machine and versions.
-    """
+    """All ratios and rates, nested, with machine and versions; `quick`: smaller dataset and fewer repetitions."""
     place = pick_device(device)
     torch.manual_seed(0)
     repeats = 5 if quick else 15
-    with tempfile.TemporaryDirectory() as folder:
-        dataset, opening = synthetic_set(Path(folder), 20 if quick else 200)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        dataset, opening = synthetic_set(folder, 20 if quick else 200)
         results: dict[str, Any] = {"opening": opening, "sampling": sampling(dataset, repeats)}
         dataset.to(place)
         results |= {
-            "pretraining": pretraining(dataset, Path(folder), repeats),
+            "pretraining": pretraining(dataset, folder, repeats),
             "finetuning": finetuning(dataset, repeats),
             "jax": against_jax(dataset, max(2, repeats // 3)),
             "stacking": stacking(dataset, max(2, repeats // 3)),
-            "methods": methods(dataset, Path(folder), repeats),
-            "memories": memories(dataset, Path(folder), repeats),
-            "memory": memory(Path(folder), dataset.frames.numel()),
+            "methods": methods(dataset, folder, repeats),
+            "memories": memories(dataset, folder, repeats),
+            "memory": memory(folder, dataset.frames.numel()),
         }
     results["collection"] = collection(60 if quick else 200)
     results["sharing"] = sharing(3 if quick else 10)
@@ -134,13 +127,13 @@ def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]],
     for name in ("value", "goal", ""):
         table.add_column(name, justify="right")
     for name, value in flatten(results).items():
-        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
         relation, goal = goals.get(name, ("", 0.0))
-        if relation and float(shown) == goal:
-            shown = str(value)  # do not round a missed goal to the goal
+        if relation and float(text) == goal:
+            text = str(value)  # do not round a missed goal to the goal
         reached = value <= goal if relation == "<=" else value >= goal if relation else None
         verdict = {True: "[green]reached[/]", False: "[red]missed[/]", None: ""}[reached]
-        table.add_row(name, shown, f"{relation} {goal:g}" if relation else "", verdict)
+        table.add_row(name, text, f"{relation} {goal:g}" if relation else "", verdict)
     Console().print(table)
 
 
@@ -193,10 +186,9 @@ def synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]
         }
         write_shard(folder / "set" / f"{shard // 20}_bench.hdf5", arrays, {})
     start = time.perf_counter()
-    open_dataset(folder / "set", folder / "cache")
+    dataset = open_dataset(folder / "set", folder / "cache")
     decoding = time.perf_counter() - start
     opening = seconds_of(lambda: open_dataset(folder / "set", folder / "cache"), 3)
-    dataset = open_dataset(folder / "set", folder / "cache")
     return dataset, {"rows": dataset.num_rows, "decode_seconds": decoding, "open_seconds": opening}
 
 
@@ -238,8 +230,8 @@ def collection(frames: int) -> dict[str, float]:
     rounds = [[rate(_acting(render), frames // ROUNDS) for render in ("exact", "fast")] for _ in range(ROUNDS)]
     exact, fast = (statistics.median(column) for column in zip(*rounds, strict=True))
     difference = compare(canary_frames("walker_walk", "fast"), canary_frames("walker_walk", "exact"))
-    alone = frames / next(iter(run_jobs(_render_wall, [("fast", frames)], 1)))
-    together = sum(frames / seconds for seconds in run_jobs(_render_wall, [("fast", 4 * frames)] * 2, 2)) * 4
+    alone = frames / next(iter(run_jobs(_render_wall, [frames], 1)))
+    together = sum(frames / seconds for seconds in run_jobs(_render_wall, [4 * frames] * 2, 2)) * 4
     return {
         "exact_frames_per_cpu_s": exact,
         "fast_frames_per_cpu_s": fast,
@@ -249,11 +241,11 @@ def collection(frames: int) -> dict[str, float]:
     }
 
 
-def _render_wall(job: tuple[Any, int]) -> float:
-    """Wall-clock seconds of one job, without process start."""
-    act = _acting(job[0])
+def _render_wall(frames: int) -> float:
+    """Wall-clock seconds of fast rendering, without process start."""
+    act = _acting("fast")
     start = time.perf_counter()
-    for _ in range(job[1]):
+    for _ in range(frames):
         act()
     return time.perf_counter() - start
 
@@ -277,19 +269,18 @@ def maze_pictures(frames: int) -> dict[str, float]:
     from vd4rl_pomdp.envs.maze import MazeEnv, gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    default: Any = gymnasium.make(
-        "PointMaze_UMaze-v3", render_mode="rgb_array", width=PICTURE_SIZE, height=PICTURE_SIZE
-    )
+    size: dict[str, Any] = {"width": PICTURE_SIZE, "height": PICTURE_SIZE}
+    default: Any = gymnasium.make("PointMaze_UMaze-v3", render_mode="rgb_array", **size)
     default.reset(seed=0)
-    speeds = {"default_frames_per_cpu_s": rate(default.render, frames)}
+    usual = rate(default.render, frames)
+    default.close()
+    speeds, ratios = {"default_frames_per_cpu_s": usual}, {}
     for name, maze in (("fast", "no_curtain"), ("first_person", "first_person")):
         env = MazeEnv(maze)
         env.reset(seed=0, options={"state": np.array([1.0, 1.0] + [0.0] * (4 if maze == "first_person" else 2))})
         speeds[f"{name}_frames_per_cpu_s"] = rate(env.draw, frames)
-    default.close()
-    for name in ("fast", "first_person"):
-        speeds[f"{name}_over_default"] = speeds[f"{name}_frames_per_cpu_s"] / speeds["default_frames_per_cpu_s"]
-    return speeds
+        ratios[f"{name}_over_default"] = speeds[f"{name}_frames_per_cpu_s"] / usual
+    return speeds | ratios
 
 
 def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
@@ -314,20 +305,17 @@ def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
     Methods that regress states are left out: a synthetic dataset has none.
     """
-    trained = [name for name, method in METHODS.items() if method.trained and not method.regresses_state]
     config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
+
+    def step(**settings: Any) -> Callable[[], Any]:
+        return make_trainer(dataset, config.altered(**settings)).update
+
     results: dict[str, Any] = {}
-    for name in trained:
-        trainer = make_trainer(dataset, config.altered(method=name))
-        seconds = seconds_of(trainer.update, max(3, repeats // 3))
-        frames = config.batch_size * config.window / seconds
-        results[name] = {"step_ms": seconds * 1e3, "frames_per_s": frames}
-    narrow, wide = (make_trainer(dataset, config.altered(max_k=k)).update for k in (15, 30))
-    once, twice = alternating(repeats, narrow, wide)
-    encoders = ("nature", "nature_half")
-    whole, half = alternating(
-        repeats, *(make_trainer(dataset, config.altered(frame_encoder=name)).update for name in encoders)
-    )
+    for name in (name for name, method in METHODS.items() if method.trained and not method.regresses_state):
+        seconds = seconds_of(step(method=name), max(3, repeats // 3))
+        results[name] = {"step_ms": seconds * 1e3, "frames_per_s": config.batch_size * config.window / seconds}
+    once, twice = alternating(repeats, step(max_k=15), step(max_k=30))
+    whole, half = alternating(repeats, step(frame_encoder="nature"), step(frame_encoder="nature_half"))
     return results | {"k_30_over_k_15": twice / once, "half_over_whole_resolution": half / whole}
 
 
@@ -343,51 +331,46 @@ def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
         for _ in range(10):
             _, state = encoder.step(obs, action, state)
 
-    rounds, gru = max(3, repeats // 3), list(MEMORIES).index("gru")
-    steps = alternating(rounds, *(trainer.update for trainer in trainers))
+    steps = alternating(max(3, repeats // 3), *(trainer.update for trainer in trainers))
     rows = alternating(repeats, *(partial(stream, trainer.objective.encoder) for trainer in trainers))
-    measured = {f"{name}_step_over_gru": seconds / steps[gru] for name, seconds in zip(MEMORIES, steps, strict=True)}
-    measured |= {f"{name}_row_over_gru": seconds / rows[gru] for name, seconds in zip(MEMORIES, rows, strict=True)}
-    return {name: ratio for name, ratio in measured.items() if not name.startswith("gru_")}
+    gru = list(MEMORIES).index("gru")
+    return {
+        f"{name}_{what}_over_gru": seconds / times[gru]
+        for what, times in (("step", steps), ("row", rows))
+        for name, seconds in zip(MEMORIES, times, strict=True)
+        if name != "gru"
+    }
 
 
 def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Updates on cached features relative to updates that encode every batch, for both kinds of encoder; cost of
-    ReBRAC.
+    """Updates/s on cached features and on batches that are encoded each, for both kinds of encoder; cost of ReBRAC.
 
-        The history is cut to a window, since encoding whole episodes per batch would take even longer.
+    The history is cut to a window, since encoding whole episodes per batch would take even longer.
     """
+    config, device = _small(), dataset.t.device
     memoryless = EncoderConfig(dataset.action_dim)
     history = replace(memoryless, history="gru", use_actions=True, history_window=HISTORY_WINDOW)
-    results = {
-        "fp32": _updates_per_s(dataset, memoryless, "fp32", repeats // 3),
-        "bf16": _updates_per_s(dataset, memoryless, "bf16", repeats),
-        "history_bf16": _updates_per_s(dataset, history, "bf16", 1),
+    results: dict[str, float] = {}
+    cases: dict[str, tuple[EncoderConfig, Precision, int]] = {
+        "fp32": (memoryless, "fp32", max(1, repeats // 3)),
+        "bf16": (memoryless, "bf16", repeats),
+        "history_bf16": (history, "bf16", 1),
     }
-    rates = {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+    for kind, (encoder_config, precision, rounds) in cases.items():
+        encoder = Encoder(encoder_config).eval().to(device)
+        frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch+zero_frames"), config.shift, precision, 0)
+        features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
+        exact = next_update(config, dataset, encoder.dim, partial(ExactSampler, frozen, NO_OPTIONS, BATCH, 3, 0.99))
+        many, few = 20, ALGORITHMS[config.algorithm].period  # a whole period of delayed updates
+        updates = _some(many, on_features(config, dataset, features)), _some(few, exact)
+        fast, slow = alternating(rounds, *updates)
+        results |= {f"{kind}_cached_updates_per_s": many / fast, f"{kind}_exact_updates_per_s": few / slow}
+        results[f"{kind}_cached_over_exact"] = (slow / few) / (fast / many)
     features = random_features(dataset, 1)
     td3_bc, rebrac = alternating(
         repeats, *(_some(20, on_features(_small(algorithm=name), dataset, features)) for name in ("td3_bc", "rebrac"))
     )
-    return rates | {"rebrac_over_td3_bc": rebrac / td3_bc}
-
-
-def _updates_per_s(
-    dataset: Dataset, encoder_config: EncoderConfig, precision: Precision, repeats: int
-) -> dict[str, float]:
-    """Updates/s on cached features and with exact encoding; the latter over one period of the algorithm's delayed
-    updates."""
-    config, device = _small(), dataset.t.device
-    encoder = Encoder(encoder_config).eval().to(device)
-    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch+zero_frames"), config.shift, precision, 0)
-    features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
-    exact = next_update(
-        config, dataset, encoder.dim, lambda draws: ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, draws)
-    )
-    many, few = 20, ALGORITHMS[config.algorithm].period
-    fast, slow = alternating(max(1, repeats), _some(many, on_features(config, dataset, features)), _some(few, exact))
-    fast, slow = fast / many, slow / few
-    return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
+    return results | {"rebrac_over_td3_bc": rebrac / td3_bc}
 
 
 def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 1024)) -> dict[str, Any]:
@@ -460,15 +443,9 @@ def next_update(
     runs: int = 1,
     encoder: Encoder | None = None,
 ) -> Callable[[], dict[str, torch.Tensor]]:
-    """A function that makes one training update of a run or a stack, including sampling.
+    """A function that makes one training update of a run, or of a stack of `runs`, including sampling.
 
-    Args:
-        config: settings of the run.
-        dataset: its dataset, on the device.
-        dim: width of representations.
-        batches: makes its sampler from a random stream.
-        runs: number of runs in the stack.
-        encoder: encoder to train, for an end-to-end method.
+    `batches` makes a sampler of (B, dim) representations from a random stream; an end-to-end method trains `encoder`.
     """
     device, trainers = dataset.t.device, []
     unwritten: Any = [None] * 4  # outputs, and the reference to compare results with

@@ -10,7 +10,7 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, disk_error, in_one_line
@@ -58,13 +58,11 @@ program name. Its module is imported on call: imports can take seconds (torch), 
 """
 
 
-@dataclass(frozen=True)
-class End:
-    """How a command ended."""
+class End(NamedTuple):
+    """How a command ended: exit code, and a message for the user, empty for none."""
 
     code: int = 0
     line: str = ""
-    """Message for the user; empty for none."""
 
 
 _NO_MEMORY = re.compile("out of memory|allocate memory|Storage size calculation overflowed|ALLOC_FAILED")
@@ -108,10 +106,10 @@ def run_to_end(words: Sequence[str]) -> End:
         return End(2, f"error: {error.object!a} is not UTF-8: use another name")
     except FloatingPointError as error:
         return End(1, f"error: training diverged, {error}; lower --learning-rate or use fp32")
-    except KeyboardInterrupt as error:
-        return End(130, _resume("interrupted", str(error)))
-    except interrupt.Terminated as error:
-        return End(143, _resume("terminated", error.reason))
+    except (KeyboardInterrupt, interrupt.Terminated) as error:  # the message says where training stopped
+        code, how = (130, "interrupted") if isinstance(error, KeyboardInterrupt) else (143, "terminated")
+        where = getattr(error, "reason", str(error))
+        return End(code, f"{how}: {where}{'; ' if where else ''}re-run the same command to resume")
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
         return End(141)
     except (MemoryError, RuntimeError) as error:
@@ -120,14 +118,9 @@ def run_to_end(words: Sequence[str]) -> End:
         line = f"error: out of memory ({in_one_line(error)[:200]}); lower --batch-size, or what else sets the size"
         return End(OutOfMemoryError.code, line)
     except OSError as error:
-        told = disk_error(error.filename, error)
-        return End(told.code, f"error: {told}")
+        named = disk_error(error.filename, error)
+        return End(named.code, f"error: {named}")
     return End()
-
-
-def _resume(how: str, kept: str) -> str:
-    """Message after a signal; `kept` says where training stopped."""
-    return f"{how}: {kept + '; ' if kept else ''}re-run the same command to resume"
 
 
 def _show_commands(words: list[str]) -> None:

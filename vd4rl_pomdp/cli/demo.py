@@ -26,8 +26,7 @@ from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.workers import count_workers
 from vd4rl_pomdp.studies.navigation.figures import write_film
-from vd4rl_pomdp.studies.navigation.measures import refitted_error
-from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs
+from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs, refitted_error
 from vd4rl_pomdp.sweeps.driver import visible_gpus
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.grid import load_grid

@@ -36,6 +36,6 @@ def show(result: dict[str, Any], as_json: bool) -> None:
 def _text(value: Any) -> str:
     """A value as one line; long lists are shortened to their ends and length."""
     if isinstance(value, list):
-        shown = value if len(value) <= _LONGEST_LIST else [value[0], "...", value[-1], f"({len(value)})"]
-        return " ".join(map(str, shown))
+        items = value if len(value) <= _LONGEST_LIST else [value[0], "...", value[-1], f"({len(value)})"]
+        return " ".join(map(str, items))
     return f"{value:.6g}" if isinstance(value, float) else str(value)

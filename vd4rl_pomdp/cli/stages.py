@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
 from vd4rl_pomdp.core.options import LABELS, Options, flat
 from vd4rl_pomdp.core.parsing import chosen_by, parse, parse_stage
-from vd4rl_pomdp.core.registry import REGISTRIES, Registry
+from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.runs import EPISODES_FILE
 
@@ -33,38 +32,35 @@ def finetune(words: list[str], program: str) -> None:
     from finetune.config import FinetuneConfig
     from finetune.train import finetune_all
 
-    runs = [one for part in _between(words, "+") for one in _of_seeds(part)]
-    configs = [parse_stage(FinetuneConfig, one, program) for one in runs]
-    for run in finetune_all(configs, runs if len(runs) > 1 else None):
-        print(f"episodes: {run.path / EPISODES_FILE}")
-
-
-def _between(words: list[str], mark: str) -> list[list[str]]:
-    """Split words at each `mark`."""
-    ends = [number for number, word in enumerate(words) if word == mark]
-    return [words[first:end] for first, end in zip([0, *(e + 1 for e in ends)], [*ends, len(words)], strict=True)]
+    parts: list[list[str]] = [[]]
+    for word in words:
+        if word == "+":
+            parts.append([])
+        else:
+            parts[-1].append(word)
+    runs = [run for part in parts for run in _of_seeds(part)]
+    configs = [parse_stage(FinetuneConfig, run, program) for run in runs]
+    for done in finetune_all(configs, runs if len(runs) > 1 else None):
+        print(f"episodes: {done.path / EPISODES_FILE}")
 
 
 def _of_seeds(words: list[str]) -> list[list[str]]:
     """One list of words per seed of `--seeds`, with `--seed N --out OUT/seedN`; without the flag, the words as
     given."""
     reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    reader.add_argument("--seeds", nargs="?", const="")
-    seeds, rest = reader.parse_known_args(words)
-    if seeds.seeds is None:
+    for flag in ("--seeds", "--seed", "--out"):
+        reader.add_argument(flag, nargs="?", const="")
+    given, rest = reader.parse_known_args(words)
+    if given.seeds is None:
         return [words]
-    numbers = seeds.seeds.split(",")
-    if not all(number.isdecimal() for number in numbers) or len(set(numbers)) < len(numbers):
-        raise UserError(f"--seeds is {seeds.seeds!r}: give different whole numbers, as in --seeds 0,1,2")
-    reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    reader.add_argument("--out")
-    reader.add_argument("--seed")
-    told, rest = reader.parse_known_args(rest)
-    if told.seed is not None:
+    seeds = given.seeds.split(",")
+    if not all(seed.isdecimal() for seed in seeds) or len(set(seeds)) < len(seeds):
+        raise UserError(f"--seeds is {given.seeds!r}: give different whole numbers, as in --seeds 0,1,2")
+    if given.seed is not None:
         raise UserError("--seed and --seeds are both given: leave one out")
-    if told.out is None:
+    if not given.out:
         raise UserError("--seeds needs --out OUT: its runs are OUT/seed0 and so on")
-    return [[*rest, "--seed", number, "--out", str(Path(told.out) / f"seed{number}")] for number in numbers]
+    return [[*rest, "--seed", seed, "--out", str(Path(given.out) / f"seed{seed}")] for seed in seeds]
 
 
 @dataclass(frozen=True)
@@ -91,55 +87,53 @@ class Evaluation:
     """Print one JSON object."""
 
 
-def _evaluation(words: list[str], program: str, own: dict[str, Any]) -> Evaluation:
-    """Parse the command line; options of the corruption that are not given default to `own`."""
-    name = chosen_by(words, ["corruption"]).get("corruption")
-    stages = CorruptionConfig.fill(own | {"corruption": name}).stages if name else ()
-    asked: Evaluation = parse(Evaluation, words, program, Evaluation(tyro.MISSING, name, stages))
-    return asked
-
-
 def evaluate(words: list[str], program: str) -> None:
     """Evaluate a fine-tuned run again, as trained and without corruption, or under a given corruption only."""
     from finetune.evaluation import another, by_part, evaluate_run, refuse_kept
     from vd4rl_pomdp.data.reference import Reference, summarise
     from vd4rl_pomdp.nn.encoder_folder import read_record
     from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
-    from vd4rl_pomdp.runs.files import flatten
+    from vd4rl_pomdp.runs.files import flatten, groups
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
-    asked = _evaluation(words, program, {})
-    run, out, parts, json = asked.run, asked.out, asked.parts, asked.json
+    name = chosen_by(words, ["corruption"]).get("corruption")
+
+    def parsed(trained: dict[str, Any]) -> Evaluation:
+        """Settings; options of the corruption that are not given default to those in training."""
+        stages = CorruptionConfig.fill(trained | {"corruption": name}).stages if name else ()
+        evaluation: Evaluation = parse(Evaluation, words, program, Evaluation(tyro.MISSING, name, stages))
+        return evaluation
+
+    config = parsed({})
+    run, out, parts = config.run, config.out, config.parts
     refuse_number("parts", parts, 1)
-    there = read_episodes(run / EPISODES_FILE)  # a folder without a run is rejected below
-    trained = read_record(run / "encoder").pretrain.corruption if there else {}
-    asked = _evaluation(words, program, trained)
+    has_rows = bool(read_episodes(run / EPISODES_FILE))  # a folder without a run is rejected below
+    trained = read_record(run / "encoder").pretrain.corruption if has_rows else {}
+    config = parsed(trained)
     if out is not None:
         refuse_inside(out)
-        if there:
+        if has_rows:
             append_episodes(out, [])  # fail before playing if the file cannot be written
-    options = {name: value for stage in asked.stages for name, value in flat(stage).items()}
-    if asked.keep and asked.corruption is None:
+    options = {option: value for stage in config.stages for option, value in flat(stage).items()}
+    if config.keep and config.corruption is None:
         raise UserError("--keep needs --corruption: a run's own evaluations are kept already")
-    if asked.keep and there:
-        refuse_kept(run, another(trained, asked.corruption or "", options)[1])
-    rows, played = evaluate_run(run, asked.corruption, asked.episodes, asked.workers, **options)
-    if asked.keep:
+    if config.keep and has_rows:
+        refuse_kept(run, another(trained, config.corruption or "", options)[1])
+    rows, played = evaluate_run(run, config.corruption, config.episodes, config.workers, **options)
+    if config.keep:
         refuse_kept(run, rows[0]["evaluated_under"])  # again: another process may have kept the same meanwhile
-    for file in [*([out] if out else []), *([run / EPISODES_FILE] if asked.keep else [])]:
+    for file in [*([out] if out else []), *([run / EPISODES_FILE] if config.keep else [])]:
         append_episodes(file, rows)
     reference = Reference.read(run)
-    labels = {k: rows[0][k] for k in (*LABELS, "step")}
-    known = {"data_return": reference.data_return, "path_error": reference.path_error}
-    under: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys(row["evaluated_under"] for row in rows):
-        mine = [row for row in rows if row["evaluated_under"] == name]
-        under[name] = summarise(mine, reference) | {"episodes": mine if json else len(mine)}
+    result: dict[str, Any] = {label: rows[0][label] for label in (*LABELS, "step")}
+    result |= {"data_return": reference.data_return, "path_error": reference.path_error, "under": {}}
+    for under, mine in groups(rows, lambda row: row["evaluated_under"]).items():
+        result["under"][under] = summarise(mine, reference) | {"episodes": mine if config.json else len(mine)}
         if parts > 1:
-            under[name]["parts"] = by_part([e for e in played if e.evaluated_under == name], parts)
-    result = labels | known | {"under": under}
-    told = {name: "unknown" if value is None else value for name, value in flatten(result).items()}
-    show(result if json else told, json)
+            result["under"][under]["parts"] = by_part([e for e in played if e.evaluated_under == under], parts)
+    if not config.json:
+        result = {label: "unknown" if value is None else value for label, value in flatten(result).items()}
+    show(result, config.json)
 
 
 @command
@@ -152,16 +146,12 @@ def list_parts() -> None:
 
     for setting, registry in sorted(REGISTRIES.items()):
         print(f"{flag_of(setting)}   (entry point group {registry.group})")
-        print("\n".join(_lines(registry)), end="\n\n")
-
-
-def _lines(registry: Registry[Any]) -> Iterator[str]:
-    """One line per part of a kind, including parts of installed packages that cannot be loaded."""
-    names = [*registry, *registry.broken]
-    width = max(map(len, names))
-    for name, part in registry.items():
-        origin = f"   [{registry.origin(name)}]" if registry.origin(name) else ""
-        text = getattr(part, "summary", "") or getattr(part, "build", part).__doc__ or ""
-        yield f"  {name:<{width}}  {text.strip().partition(chr(10))[0].removesuffix('.')}{origin}".rstrip()
-    for name, reason in registry.broken.items():
-        yield f"  {name:<{width}}  cannot be loaded: {reason}"
+        width = max(map(len, [*registry, *registry.broken]))
+        for name, part in registry.items():
+            origin = f"   [{registry.origin(name)}]" if registry.origin(name) else ""
+            text = getattr(part, "summary", "") or getattr(part, "build", part).__doc__ or ""
+            line = text.strip().partition("\n")[0].removesuffix(".")
+            print(f"  {name:<{width}}  {line}{origin}".rstrip())
+        for name, reason in registry.broken.items():
+            print(f"  {name:<{width}}  cannot be loaded: {reason}")
+        print()

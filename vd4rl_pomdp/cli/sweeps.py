@@ -87,28 +87,28 @@ def run(words: list[str], program: str) -> None:
     for name in SHARED:
         if flag_of(name) in (word.partition("=")[0] for word in words):
             raise UserError(f"{flag_of(name)} is a setting of the grid's trainings: change it by --change {name}=VALUE")
-    asked = parse_stage(RunCommand, words, program)
-    grid = load_grid(asked.grid, asked.change, asked.testing)
-    cells = narrow(grid.cells(), asked.only)
-    check_cells(cells, asked.grid)
+    config = parse_stage(RunCommand, words, program)
+    grid = load_grid(config.grid, config.change, config.testing)
+    cells = narrow(grid.cells(), config.only)
+    check_cells(cells, config.grid)
     # Check before planning, which may decode datasets for minutes.
-    for place in (asked.out, asked.data or asked.out):
+    for place in (config.out, config.data or config.out):
         refuse_no_folder(place)
-    refuse_kept(asked.out)
-    folder = SweepFolder(asked.out)
-    own = [str(Path(asked.grid).resolve())] * (asked.grid not in names())  # a different file is a different grid
-    name = plan_name(grid.name, [*own, *asked.only, *asked.change, *["testing"] * asked.testing])
-    kept, sets = runs_kept(asked.done), asked.data or asked.out / DATA
-    jobs, warnings = plan_jobs(cells, asked.out, sets, kept, folder.jobs_of_others(name))
+    refuse_kept(config.out)
+    folder = SweepFolder(config.out)
+    file = [str(Path(config.grid).resolve())] * (config.grid not in names())  # a different file is a different grid
+    name = plan_name(grid.name, [*file, *config.only, *config.change, *["testing"] * config.testing])
+    data, others = config.data or config.out / DATA, folder.jobs_of_others(name)
+    jobs, warnings = plan_jobs(cells, config.out, data, runs_kept(config.done), others)
     for job in jobs:
         refuse_unknown_to_jobs(job.settings)
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    if asked.dry_run:
-        _print_plan(jobs, getattr(asked.options, "stack", 1))
+    if config.dry_run:
+        _print_plan(jobs, getattr(config.options, "stack", 1))
         return
     plan = folder.keep_plan(name, jobs, own_program())
-    carry_out([plan], folder, asked.executor, asked.options, name)
+    carry_out([plan], folder, config.executor, config.options, name)
 
 
 def _print_plan(jobs: list[Job], stack: int) -> None:
@@ -118,10 +118,9 @@ def _print_plan(jobs: list[Job], stack: int) -> None:
     users = Counter(name for job in jobs for name in job.needs)
     left: list[Job] = []
     for job in jobs:
-        done = job.finished
-        shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
-        print(f"# {job.name}: {'done' if done else 'resumes' if job.begun else 'new'}{shared}")
-        if not done:
+        state = "done" if job.finished else "resumes" if job.begun else "new"
+        print(f"# {job.name}: {state}" + f", for {users[job.name]} jobs" * (users[job.name] > 1))
+        if state != "done":
             print(f"{program_name()} {shlex.join(job.words)}")
             left.append(job)
     processes = len(in_stacks(left, stack, {}))
@@ -130,14 +129,9 @@ def _print_plan(jobs: list[Job], stack: int) -> None:
 
 
 def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
-    """Run plans to their end; SystemExit 1 if some jobs are not finished.
+    """Run plans to their end by an executor and its options; SystemExit 1 if some jobs are not finished.
 
-    Args:
-        plans: plans whose jobs are in dependency order.
-        folder: the sweep's folder.
-        kind: name of the executor.
-        options: its options.
-        name: name of the plan; empty for all plans in the folder.
+    `name` is the plan's, empty for all plans in the folder.
     """
     from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
     from vd4rl_pomdp.sweeps.driver import Driver
@@ -195,14 +189,14 @@ def retry(words: list[str], program: str) -> None:
     """Retry failed jobs."""
     from vd4rl_pomdp.sweeps.folder import SweepFolder, failed, jobs_of
 
-    asked = parse_stage(RetryCommand, words, program)
-    folder = SweepFolder(asked.out)
+    config = parse_stage(RetryCommand, words, program)
+    folder = SweepFolder(config.out)
     plans = folder.plans_to_do()
     # Append a row instead of deleting some: other drivers may be reading the file.
     for name, rows in folder.attempts(jobs_of(plans)).items():
         if failed(rows):
             folder.forget(name)
-    carry_out(plans, folder, asked.executor, asked.options)
+    carry_out(plans, folder, config.executor, config.options)
 
 
 @command

@@ -14,10 +14,11 @@ policy. Such a memory is needed if the first scores above the second and the thi
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,10 +33,9 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.probes import probe_r2
-from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gates import STATE_SHARE, converged, episodes_of
 from vd4rl_pomdp.report.load import load_runs
-from vd4rl_pomdp.report.stats import with_interval
+from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import Row, groups, read_json, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
@@ -58,14 +58,9 @@ R2_FILE = "r2.json"
 def planned(
     data: Path, corruption: str, out: Path, returns: bool, changes: Sequence[str]
 ) -> tuple[Dataset, list[GridCell], list[Job]]:
-    """The dataset, its cells of the grid, and their jobs in dependency order.
+    """The dataset, its cells of the grid, and their jobs in dependency order, OUT/METHOD/seedN/STAGE.
 
-    Args:
-        data: folder of a dataset with simulator states.
-        corruption: name of a corruption.
-        out: folder of the runs, OUT/METHOD/seedN/STAGE.
-        returns: whether to train policies as well.
-        changes: overrides for the grid, e.g. "pretrain.steps=100" or "seed=0,1".
+    With `returns`, policies are trained as well; `changes` override the grid: "pretrain.steps=100" or "seed=0,1".
     """
     dataset = open_dataset(data)
     dataset.require_states()
@@ -81,38 +76,39 @@ def planned(
             raise UserError("--change finetune.* is for policies, which are trained with --returns: add it")
         without = [replace(c, sections={n: s for n, s in c.sections.items() if n != "finetune"}) for c in cells]
         cells = [cell for cell in without if cell.value("method") != STATE]
-    jobs = [job for cell in cells for job in _jobs(cell, data, out)]
+    jobs: list[Job] = []
+    for cell in cells:
+        before, values = list[str](), dict[str, object]()
+        for section in cell.chain[1:]:
+            name = f"{_place(cell)}/{section}"
+            encoder = {"encoder": out / before[-1] / "encoder"} if before else {}
+            words = [
+                *COMMANDS[section],
+                *words_of(told(cell, section) | {"data": data} | encoder | {"out": out / name}),
+            ]
+            values |= recorded(cell, section)
+            settings = {key: str(value) for key, value in settings_of(values).items()}
+            recipe = recipe_of(cell, section)
+            jobs.append(Job(name, section, out / name, words, list(before), settings=settings, recipe=recipe))
+            before.append(name)
     if len({job.name for job in jobs}) < len(jobs):
         raise UserError("--change lists several values of a setting: only seed may have several")
     return dataset, cells, jobs
 
 
-def place_of(cell: GridCell) -> str:
+def _place(cell: GridCell) -> str:
     """Folder of a cell's runs, below the common one."""
     return f"{cell.value('method')}/seed{cell.seed}"
 
 
-def _jobs(cell: GridCell, data: Path, out: Path) -> Iterator[Job]:
-    before, values = list[str](), dict[str, object]()
-    for section in cell.chain[1:]:
-        name = f"{place_of(cell)}/{section}"
-        folders = {"data": data} | ({"encoder": out / before[-1] / "encoder"} if before else {}) | {"out": out / name}
-        words = [*COMMANDS[section], *words_of(told(cell, section) | folders)]
-        values |= recorded(cell, section)
-        settings = {key: str(value) for key, value in settings_of(values).items()}
-        yield Job(name, section, out / name, words, list(before), settings=settings, recipe=recipe_of(cell, section))
-        before.append(name)
-
-
 def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: bool) -> Row:
     """Make the certificate of finished runs; it is saved in their folder and in the dataset's."""
-    places = {method: [place_of(cell) for cell in mine] for method, mine in groups(cells, _method).items()}
-    measured = {
-        "R2": judge({name: _r2(dataset, [out / place for place in places[name]]) for name in (MEMORY, *FLOORS)}, 1, 2)
-    }
+    by_method = groups(cells, lambda cell: str(cell.value("method")))
+    runs = {method: [out / _place(cell) for cell in mine] for method, mine in by_method.items()}
+    measured = {"R2": judge({method: _r2(dataset, runs[method]) for method in (MEMORY, *FLOORS)}, 1, 2)}
     if returns:
-        measured["returns"] = _returns([out / place / "finetune" for mine in places.values() for place in mine])
-    record = read_record(out / places[MEMORY][0] / "pretrain" / "encoder")
+        measured["returns"] = _returns([run / "finetune" for mine in runs.values() for run in mine])
+    record = read_record(runs[MEMORY][0] / "pretrain" / "encoder")
     hidden, usual = record.pretrain.corruption, flat(CorruptionConfig.of(record.pretrain.corruption["corruption"]))
     options = (f"{name} {value}" for name, value in hidden.items() if usual.get(name) != value)
     verdicts = {row["verdict"] for row in measured.values()}
@@ -135,33 +131,24 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     return certificate
 
 
-def _method(cell: GridCell) -> str:
-    return str(cell.value("method"))
+def _r2(dataset: Dataset, runs: Sequence[Path]) -> np.ndarray:
+    """(seeds, held-out episodes): R^2 of poses and velocities by a linear probe on the encoders' states.
 
-
-def _r2(dataset: Dataset, places: Sequence[Path]) -> np.ndarray:
-    """(seeds, held-out episodes): R^2 of the encoders in some folders."""
-    for place in places:
-        if not (file := place / "pretrain" / R2_FILE).exists():
-            write_json(file, {"r2": held_out_r2(place / "pretrain" / "encoder", dataset)})
-    return np.array([read_json(place / "pretrain" / R2_FILE)["r2"] for place in places])
-
-
-def held_out_r2(folder: Path, dataset: Dataset) -> list[float]:
-    """R^2 of poses and velocities in every held-out episode, by a linear probe on an encoder's states.
-
-    Args:
-        folder: the encoder's, pretrained on the dataset with `hold_out`.
-        dataset: the dataset; moved to a GPU if there is one.
+    The encoders were pretrained on the dataset with `hold_out`. Saved in each run's R2_FILE.
     """
-    encoder, card = load_encoder(folder, dataset.task, dataset.action_dim, dataset.frame_size)
-    device = pick_device("auto")
-    corruption, precision = CorruptionConfig.fill(card.corruption), card.settings["precision"]
-    frozen = FrozenEncoder(encoder.to(device), dataset.to(device), corruption, 0, precision, card.seed)
-    view = frozen.view(0)
-    with torch.no_grad():
-        parts = [read_whole(encoder, frozen.frames(some, view), dataset, some).cpu() for some in frozen.groups()]
-    return probe_r2(torch.cat(parts).numpy(), dataset.states().cpu().numpy(), dataset.episode.cpu().numpy())
+    for file in (run / "pretrain" / R2_FILE for run in runs):
+        if file.exists():
+            continue
+        encoder, card = load_encoder(file.parent / "encoder", dataset.task, dataset.action_dim, dataset.frame_size)
+        device = pick_device("auto")
+        corruption, precision = CorruptionConfig.fill(card.corruption), card.settings["precision"]
+        frozen = FrozenEncoder(encoder.to(device), dataset.to(device), corruption, 0, precision, card.seed)
+        view = frozen.view(0)
+        with torch.no_grad():
+            parts = [read_whole(encoder, frozen.frames(some, view), dataset, some).cpu() for some in frozen.groups()]
+        features, states = torch.cat(parts).numpy(), dataset.states().cpu().numpy()
+        write_json(file, {"r2": probe_r2(features, states, dataset.episode.cpu().numpy())})
+    return np.array([read_json(run / "pretrain" / R2_FILE)["r2"] for run in runs])
 
 
 def _returns(folders: Sequence[Path]) -> Row:
@@ -181,30 +168,22 @@ def _returns(folders: Sequence[Path]) -> Row:
 
 
 def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
-    """Verdict: whether the memory scores above both floors.
-
-    Args:
-        values: (seeds, episodes) by method.
-        unit: unit of MARGIN and ENOUGH.
-        digits: decimals in the text.
-    """
-    row: Row = {"methods": {}, "above": {}}
-    for name, scores in values.items():
-        row["methods"][name] = [float(scores.mean()), *(stats.mean_interval(scores) or (None, None))]
+    """Verdict: whether the memory scores above both floors; (seeds, episodes) by method, `unit` that of MARGIN and
+    ENOUGH, `digits` for the text."""
+    methods: dict[str, Any] = {
+        name: (float(scores.mean()), *(mean_interval(scores) or (None, None))) for name, scores in values.items()
+    }
+    above: dict[str, Any] = {}
     for floor in FLOORS:
-        difference = float(values[MEMORY].mean() - values[floor].mean())
-        ends = stats.difference_interval(values[MEMORY], values[floor]) or (None, None)
-        row["above"][floor] = [difference, *ends]
-    above = row["above"].values()
-    known, weak = all(low is not None for _, low, _ in above), row["methods"][MEMORY][0] < ENOUGH * unit
-    verdict = NEEDS if known and all(low > 0 for _, low, _ in above) else OPEN
-    if known and any(high < MARGIN * unit for *_, high in above):
+        ends = difference_interval(values[MEMORY], values[floor]) or (None, None)
+        above[floor] = (float(values[MEMORY].mean() - values[floor].mean()), *ends)
+    known = all(low is not None for _, low, _ in above.values())
+    weak = methods[MEMORY][0] < ENOUGH * unit
+    verdict = NEEDS if known and all(low > 0 for _, low, _ in above.values()) else OPEN
+    if known and any(high < MARGIN * unit for *_, high in above.values()):
         verdict = OPEN if weak else NEEDS_NOT
-
-    def told_of(three: Sequence[float | None]) -> str:
-        return with_interval(three[0], three[1], three[2], digits)
-
-    told = [f"{MEMORY} {told_of(row['methods'][MEMORY])}"]
-    told += [f"less {floor} {told_of(ends)}" for floor, ends in row["above"].items()]
-    told += ["too few seeds"] * (not known) + ["itself too low to judge"] * (weak and verdict == OPEN)
-    return row | {"verdict": verdict, "why": ", ".join(told)}
+    mean, low, high = methods[MEMORY]
+    why = [f"{MEMORY} {with_interval(mean, low, high, digits)}"]
+    why += [f"less {floor} {with_interval(mean, low, high, digits)}" for floor, (mean, low, high) in above.items()]
+    why += ["too few seeds"] * (not known) + ["itself too low to judge"] * (weak and verdict == OPEN)
+    return {"methods": methods, "above": above, "verdict": verdict, "why": ", ".join(why)}

@@ -77,10 +77,7 @@ class GridCell:
         return self.shared.get("seed", 0)
 
     def value(self, name: str) -> Any:
-        """Value of `section.name`, or of `name` in whichever section sets it; None if none does.
-
-        UserError if sections set `name` to different values.
-        """
+        """Value of `section.name`, or of `name` in whichever section sets it (None: none); UserError if they differ."""
         return _value_of(self.sections, name)
 
 

@@ -17,8 +17,8 @@ from vd4rl_pomdp.report.gates import episodes_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
 from vd4rl_pomdp.runs.files import read_json
-from vd4rl_pomdp.studies.navigation.measures import online_error, refitted_error
 from vd4rl_pomdp.studies.navigation.report import write_report
+from vd4rl_pomdp.studies.navigation.runs import online_error, refitted_error
 
 ROOT = Path(__file__).parents[3]
 TOLD = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?|[-+]?\d+(?: more| less| above it)? \[-?\d+, -?\d+\]")

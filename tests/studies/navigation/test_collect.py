@@ -47,12 +47,8 @@ def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tm
 
 def test_a_check_replays_the_states(maze_set, tmp_path):
     report = check_dataset(maze_set, tmp_path / "cache")
-    assert (report["task"], report["rows"], report["episodes"], report["replay_max_error"]) == (
-        "three_curtains",
-        120,
-        4,
-        0,
-    )
+    names = ("task", "rows", "episodes", "replay_max_error")
+    assert [report[name] for name in names] == ["three_curtains", 120, 4, 0]
     damaged = tmp_path / "damaged"
     shutil.copytree(maze_set, damaged)
     with h5py.File(damaged / "1_three_curtains.hdf5", "a") as file:
@@ -79,12 +75,10 @@ def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, mo
 
 
 def test_repeat_and_seed_change_the_set(maze_set, tmp_path):
-    found = [hashes(maze_set)]
-    for i, changes in enumerate([{"action_repeat": 2}, {"seed": 1}]):
-        collect(small(tmp_path / str(i), trajectories=2, **changes))
-        found.append(hashes(tmp_path / str(i)))
-    firsts = [files["0_three_curtains.hdf5"] for files in found]
-    assert len(set(firsts)) == 3
+    collect(small(tmp_path / "repeat", trajectories=2, action_repeat=2))
+    collect(small(tmp_path / "seed", trajectories=2, seed=1))
+    folders = (maze_set, tmp_path / "repeat", tmp_path / "seed")
+    assert len({hashes(folder)["0_three_curtains.hdf5"] for folder in folders}) == 3
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from PIL import Image
 
@@ -15,24 +14,21 @@ from vd4rl_pomdp.envs.mazes import FREE_CELLS, PAPER_MAZES
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.studies.navigation import figures
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.measures import (
+from vd4rl_pomdp.studies.navigation.report import claims, judge, verdict_lines, write_report
+from vd4rl_pomdp.studies.navigation.runs import (
     OBJECTIVES,
     RAW_PREFIX,
     REFERENCES,
     Condition,
     Measure,
+    NavigationRun,
     condition_of,
+    find_navigation,
+    load_runs,
+    numbers_of,
     paper_number,
     paper_rows,
     refitted_error,
-)
-from vd4rl_pomdp.studies.navigation.report import claims, judge, verdict_lines, write_report
-from vd4rl_pomdp.studies.navigation.runs import (
-    NavigationRun,
-    find_navigation,
-    frame_of,
-    load_runs,
-    numbers_of,
 )
 
 TRAJECTORY = "three_curtains-mik-K15-seed0.csv"
@@ -97,10 +93,6 @@ def loaded(*paths: Path) -> list[NavigationRun]:
     return load_runs(find_navigation(paths))
 
 
-def frame(*paths: Path) -> pd.DataFrame:
-    return frame_of(loaded(*paths))
-
-
 def change(file: Path, **told) -> None:
     """Put other values into a JSON file, one level deep where they are dicts."""
     stored = json.loads(file.read_text())
@@ -160,16 +152,6 @@ def test_the_report_made_from_its_own_rows_is_the_same_and_runs_are_added_to_it(
         write_report([tmp_path / "more"], tmp_path / "out")
     write_report([tmp_path / "out", tmp_path / "more"], tmp_path / "out")
     assert len(loaded(tmp_path / "out")) == 31
-
-
-def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_path):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "README.md").write_text("mine")
-    run = runs / "three_curtains" / "mik-K15" / "seed0"
-    for out in (tmp_path / "mine", runs, run, run / "report"):
-        with pytest.raises(UserError, match="choose another"):
-            write_report([runs], out)
-    assert (tmp_path / "mine" / "README.md").read_text() == "mine"
 
 
 def test_what_was_not_trained_alike_is_said(tmp_path):
@@ -237,16 +219,16 @@ def test_the_bar_plot_marks_the_papers_numbers_and_crosses_what_has_no_run(runs,
     counts = {}
     for measure in (STATE, STATE.raw()):
         drawn.clear()
-        assert figures.accuracy_bars(frame(runs), measure, tmp_path / "bars.png")
+        assert figures.accuracy_bars(loaded(runs), measure, tmp_path / "bars.png")
         counts[measure.is_raw] = [sum(marker == kind and at[0] != [] for at, marker in drawn) for kind in "_x"]
     in_the_paper, ran, references = 19, 9, len(REFERENCES) - 1
     assert counts[False] == [0, in_the_paper - ran + references], "the paper's units are raw"
     assert counts[True] == [in_the_paper, in_the_paper - ran + references]
     write_run(tmp_path / "runs", Condition("three_curtains", "no_history"), 0, 121.0, raw=False)
-    assert not figures.accuracy_bars(frame(tmp_path / "runs"), STATE.raw(), tmp_path / "bars.png")
+    assert not figures.accuracy_bars(loaded(tmp_path / "runs"), STATE.raw(), tmp_path / "bars.png")
     ends = []
     monkeypatch.setattr("matplotlib.axes.Axes.set_ylim", lambda axes, *told, **_: ends.append(told))
-    figures.accuracy_bars(frame(tmp_path / "runs"), STATE, tmp_path / "bars.png")
+    figures.accuracy_bars(loaded(tmp_path / "runs"), STATE, tmp_path / "bars.png")
     assert min(told[0] for told in ends if len(told) == 2) == -21, "an error of more than 100 is in the picture"
 
 
@@ -254,7 +236,7 @@ def test_in_first_person_the_place_must_be_known_by_far_and_in_the_papers_order(
     levels = {("random", 0): 40, ("mik+a", 0): 21, ("mik+a", 1): 14, ("no_history", 0): 30, ("ah+a", 0): 25}
     for (method, sp), level in levels.items():
         write_run(tmp_path, Condition("compass_first_person", method, self_prediction=bool(sp)), 0, level)
-    found = numbers_of(frame(tmp_path))
+    found = numbers_of(loaded(tmp_path))
     told = [
         claim for claim in claims("compass_first_person") if "state error" in claim.text and "K=1" not in claim.text
     ]
@@ -271,7 +253,7 @@ def test_in_first_person_the_place_must_be_known_by_far_and_in_the_papers_order(
 
 
 def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs):
-    page = verdict_lines(frame(runs))
+    page = verdict_lines(loaded(runs))
     rows = {line.split(" | ")[1]: line for line in page if line.startswith("| three_curtains | ")}
     assert rows["no_history's velocity error, of mik+a's >= 3 x"].endswith(
         "| 81.0 / 21.0 | **yes** | 3 of 3 | 121.5 / 31.5 | **yes** | 91.9 / 5.7: yes |"
@@ -297,7 +279,7 @@ def test_what_raw_units_change_is_said_and_without_them_no_number_of_the_paper_i
         results = write_run(tmp_path / "both", Condition("three_curtains", method), 0, level) / "results.json"
     rows = json.loads(results.read_text())["rows"]
     change(results, rows=[row | {"value": row["value"] * (0.1 if RAW_PREFIX in row["measure"] else 1)} for row in rows])
-    text = "\n".join(verdict_lines(frame(tmp_path / "both")))
+    text = "\n".join(verdict_lines(loaded(tmp_path / "both")))
     assert "1 change (three_curtains: no_history's velocity error, of mik+a's)." in text
     for method in ("mik+a", "no_history"):
         write_run(tmp_path / "runs", Condition("hard_three_curtains", method), 0, 9.0, raw=False)

@@ -13,15 +13,17 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
-from vd4rl_pomdp.studies.navigation.data import MazeData
-from vd4rl_pomdp.studies.navigation.measures import METHOD_NAMES, OBJECTIVES
+from vd4rl_pomdp.studies.navigation.runs import METHOD_NAMES, OBJECTIVES
 from vd4rl_pomdp.studies.navigation.train import (
     ErrorSums,
+    MazeData,
     ProbedObjective,
     StateProbe,
+    evaluate,
     learning_rate,
     make_trainer,
     refit,
+    refitted_errors,
     train,
 )
 
@@ -254,3 +256,32 @@ def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
         words = command_of(config)
         assert words[:3] == ["vd4rl-pomdp", "navigation", "train"]
         assert parse_stage(NavigationConfig, words[3:], "x") == config
+
+
+@pytest.fixture
+def probed(maze_set) -> ProbedObjective:
+    return trainer_of(smoke(maze_set, Path(), refit_steps=20))[1]
+
+
+def shift_states(probed: ProbedObjective, held_out: bool) -> None:
+    """Move the true states of the training or of the held-out rows."""
+    split = int(probed.data.dataset.episode_start[probed.data.first_held_out])
+    probed.data.states[slice(split, None) if held_out else slice(split)] += 3
+
+
+def test_a_refitted_probe_knows_nothing_of_held_out_states(probed: ProbedObjective):
+    probe, before = refitted_errors(probed)
+    shift_states(probed, held_out=True)
+    again, after = refitted_errors(probed)
+    for one, other in zip(probe.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+    assert before["training"] == after["training"]
+    assert after["held_out"]["state"] > before["held_out"]["state"] + 100
+
+
+def test_the_probe_beside_the_objective_is_measured_on_held_out_states_alone(probed: ProbedObjective):
+    losses, before = evaluate(probed)
+    shift_states(probed, held_out=False)
+    assert evaluate(probed) == (losses, before)
+    shift_states(probed, held_out=True)
+    assert evaluate(probed)[1]["state"] > before["state"] + 100

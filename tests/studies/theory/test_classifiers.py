@@ -6,8 +6,7 @@ from pretrain.build import build_objective
 from pretrain.config import PretrainConfig
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
-from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, compare
-from vd4rl_pomdp.studies.theory.views import VIEWS
+from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths, compare
 from vd4rl_pomdp.studies.theory.world import counterexample, future_memory, past_memory
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])

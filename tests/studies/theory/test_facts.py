@@ -7,11 +7,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 
 from tests.studies.theory.random_worlds import worlds
-from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash, compare
+from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths, clash, compare
 from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.partition import state_relation
 from vd4rl_pomdp.studies.theory.study import facts
-from vd4rl_pomdp.studies.theory.views import VIEWS
 from vd4rl_pomdp.studies.theory.world import (
     counterexample,
     distances,
@@ -60,14 +59,15 @@ def test_the_literal_readings_on_one_and_two_states():
     assert set(clash(tiny("toggle"), VIEWS["mik+a literal"], MemoryLengths(0, 0), 2).seen) == {"o_t", "a_t+1", "o_t+2"}
 
 
-def test_without_the_leak_mik_a_is_right_where_the_literal_reading_is_not():
-    for world, memory in ((tiny("idle"), (0, 0)), (tiny("toggle"), (0, 0)), (momentum(), (1, 1))):
-        assert all(clash(world, VIEWS["mik+a"], MemoryLengths(*memory), k) is None for k in (1, 2, 3))
-
-
-def test_with_the_leak_mik_a_is_right_where_the_future_decodes_only_so():
-    for world, memory in ((tiny("hidden switch"), MemoryLengths(1, 0)), (counterexample(), MemoryLengths(3, 3))):
-        assert all(clash(world, VIEWS["mik+a literal"], memory, k) is None for k in (1, 2, 3))
+@pytest.mark.parametrize(
+    ("method", "world", "m", "n"),
+    [
+        *(("mik+a", world, m, m) for world, m in ((tiny("idle"), 0), (tiny("toggle"), 0), (momentum(), 1))),
+        *(("mik+a literal", world, *mn) for world, mn in ((tiny("hidden switch"), (1, 0)), (counterexample(), (3, 3)))),
+    ],
+)
+def test_mik_a_is_right_without_the_leak_and_with_it_where_the_future_decodes_only_so(method, world, m, n):
+    assert all(clash(world, VIEWS[method], MemoryLengths(m, n), k) is None for k in (1, 2, 3))
 
 
 def merged(world, max_k):

@@ -16,9 +16,9 @@ from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.heads import all_pairs
 from vd4rl_pomdp.nn.objective import InverseObjective
+from vd4rl_pomdp.studies.theory.classifiers import VIEWS
 from vd4rl_pomdp.studies.theory.env import ExactWindows, exact_windows
 from vd4rl_pomdp.studies.theory.law import joint_law
-from vd4rl_pomdp.studies.theory.views import VIEWS
 from vd4rl_pomdp.studies.theory.world import BLANK, World, biased, counterexample, noisy, tiny
 
 MAX_K, M = 2, 1

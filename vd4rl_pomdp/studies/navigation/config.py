@@ -11,8 +11,8 @@ from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import UserError, refuse_outside, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, flat, words_of
 from vd4rl_pomdp.nn.objective import ActionOptions
-from vd4rl_pomdp.studies.navigation.measures import METHOD_NAMES, REFERENCES
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES, Picture
+from vd4rl_pomdp.studies.navigation.runs import METHOD_NAMES, REFERENCES
 
 _PAPER: dict[str, Any] = {
     "steps": 200_000,
@@ -58,8 +58,6 @@ _SMOKE: dict[str, Any] = {
     "checkpoint_every": 10,
 }
 _NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "no_history", "ah", "ah+a"), strict=True))
-
-
 """Objectives whose networks the references have."""
 
 

@@ -63,20 +63,17 @@ class Planner:
     def distance(self, position: np.ndarray, goal: np.ndarray) -> float:
         """Path length over the waypoints from a (2,) position to a goal."""
         length, here = 0.0, position
-        while True:
+        while here is not goal:
             target = self.waypoint(here, goal)
-            length += float(np.linalg.norm(target - here))
-            if target is goal:
-                return length
-            here = target
+            length, here = length + float(np.linalg.norm(target - here)), target
+        return length
 
-    def cells_after(self, position: np.ndarray, goal: np.ndarray) -> list[np.ndarray]:
-        """Centres (2,) of the cells on the shortest path from a position to a goal, without the first one."""
-        here, there, centers = self._cell(position), self._cell(goal), []
-        while here != there:
-            here = self._next[there][here]
-            centers.append(self._maze.cell_rowcol_to_xy(np.array(here)))
-        return centers
+    def cells_between(self, position: np.ndarray, goal: np.ndarray) -> list[np.ndarray]:
+        """Centres (2,) of the cells on the shortest path from a position to a goal, without the first and the last."""
+        here, there, centres = self._cell(position), self._cell(goal), []
+        while (here := self._next[there][here]) != there:
+            centres.append(self._maze.cell_rowcol_to_xy(np.array(here)))
+        return centres
 
     def _cell(self, position: np.ndarray) -> tuple[int, int]:
         row, column = self._maze.cell_xy_to_rowcol(position)
@@ -103,7 +100,7 @@ class WaypointPlanner:
         """Action (2,) float64 for a (4,) state and a (2,) goal."""
         place = state[:2]
         if not np.array_equal(goal, self._goal):
-            between = self._planner.cells_after(place, goal)[:-1]
+            between = self._planner.cells_between(place, goal)
             back = self._rng.uniform(size=(len(between), 2)) * self.JITTER * np.sign(CELL_OFFSET)
             self._ahead = [*(np.array(between).reshape(-1, 2) + CELL_OFFSET - back), goal]
             self._goal, self._before = goal, place
@@ -237,15 +234,9 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     arrays |= {f"{name}.bias": layer.bias.detach().numpy().copy() for name, layer in weights.items()}
     log_std = policy.log_std.detach().numpy().copy()  # it does not depend on the state
     arrays |= {"log_std.weight": np.zeros((layers[-1].out_features, len(log_std)), np.float32), "log_std.bias": log_std}
-    card = {
-        "task": config.maze,
-        "algorithm": "PPO",
-        "decisions": model.num_timesteps,
-        "action_repeat": config.action_repeat,
-        "seed": config.seed,
-        "stable_baselines3": version("stable-baselines3"),
-    }
-    actor = Actor(arrays, card)
+    card = {"task": config.maze, "algorithm": "PPO", "decisions": model.num_timesteps}
+    card |= {"action_repeat": config.action_repeat, "seed": config.seed}
+    actor = Actor(arrays, card | {"stable_baselines3": version("stable-baselines3")})
     actor.card["goals_in_20_episodes"] = goals_reached(actor, config.maze, config.action_repeat, 20)
     actor.save(config.out)
     return actor

@@ -7,23 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw
 
 from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
-from vd4rl_pomdp.studies.navigation.measures import (
+from vd4rl_pomdp.studies.navigation.runs import (
     OBJECTIVES,
     REFERENCES,
     Condition,
     Measure,
+    NavigationRun,
     condition_of,
+    is_missing,
+    numbers_of,
     paper_number,
     paper_rows,
+    read_trajectory,
 )
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, conditions_of, is_missing, numbers_of, read_trajectory
 
 _ESTIMATE = "#d55e00"
 _VARIANTS = {
@@ -49,32 +51,33 @@ _WALL, _FLOOR, _PAPER, _INK = (228, 201, 168), (58, 82, 110), (255, 255, 255), (
 _CURTAIN, _TRUE, _RING = (200, 140, 85, 165), (90, 200, 90), (255, 90, 0)
 
 
-def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
+def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> bool:
     """Bar plot of state prediction accuracy, 100 - error, by objective and maze, as in the paper.
 
     One panel per maze with runs of the measure; False, without a file, if there are none. The paper's numbers are shown
     only for raw units. Crosses mark missing runs that the paper, another maze or the references have.
     """
-    shown = frame[(frame[list(Measure._fields)] == list(measure)).all(axis=1)]
-    mazes = [maze for maze in MAZES if maze in set(shown["maze"])]
+    numbers, methods = numbers_of(runs), [*OBJECTIVES, *REFERENCES]
+    measured = [run for run in runs if measure in run.values]
+    mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in measured)]
     if not mazes:
         return False
-    numbers, columns, methods = numbers_of(shown), min(2, len(mazes)), [*OBJECTIVES, *REFERENCES]
+    columns = min(2, len(mazes))
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    trained, told = conditions_of(frame), {condition_of(row, "") for row in paper_rows()}
-    told |= {Condition("", method) for method in REFERENCES}
+    trained, expected = {run.condition for run in runs}, {condition_of(row, "") for row in paper_rows()}
+    expected |= {Condition("", method) for method in REFERENCES}
     for axes in panels.flat[len(mazes) :]:
         axes.set_axis_off()
     for axes, maze in zip(panels.flat, mazes, strict=False):
         for place, method in enumerate(methods):
             for offset, (max_k, self_prediction, colour) in zip(_OFFSETS, _VARIANTS.values(), strict=True):
                 condition, at = Condition(maze, method, max_k, self_prediction), place + offset
-                if accuracy := [100 - error for error in numbers.get((*condition, *measure), {}).values()]:
+                if accuracy := [100 - error for error in numbers.get((condition, measure), {}).values()]:
                     axes.bar(at, np.mean(accuracy), _WIDTH, color=colour)
                     axes.plot([at] * len(accuracy), accuracy, **_SEED)
-                elif condition._replace(maze="") in told or is_missing(condition, trained):
+                elif condition._replace(maze="") in expected or is_missing(condition, trained):
                     axes.plot(at, 2, **_NO_RUN)
                 if (paper := paper_number(condition, measure)) is not None:
                     axes.plot(at, 100 - paper, **_MARK)
@@ -82,7 +85,7 @@ def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlim(-0.6, len(methods) - 0.4)
-    panels[0, 0].set_ylim(min(0.0, 100 - shown["value"].max()), 100)
+    panels[0, 0].set_ylim(min(0.0, 100 - max(run.values[measure] for run in measured)), 100)
     for axes in panels[:, 0]:
         axes.set_ylabel(f"100 - state error ({'raw x 100' if measure.is_raw else '% of std'})")
     handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
@@ -146,12 +149,8 @@ def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
 def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> None:
     """Write an animated GIF with one panel per name.
 
-    The true mass is a green disc, visible through the curtains here; the estimate is an orange ring.
-
-    Args:
-        trajectories: `trajectory.csv` of runs on that maze, by panel title.
-        maze: maze to draw.
-        path: output file.
+    The true mass is a green disc, visible through the curtains here; the estimate is an orange ring. `trajectories`
+    are the trajectory.csv of runs on that maze.
     """
     tables = {name: read_trajectory(file) for name, file in trajectories.items()}
     ground = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)

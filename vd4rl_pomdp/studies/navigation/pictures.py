@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.reading import damaged, read_bytes
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
@@ -29,13 +29,11 @@ Picture = Literal["rgb100", "rgb50", "grey50"]
 _HALF = PICTURE_SIZE // 2
 SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "rgb50": (3, _HALF), "grey50": (1, _HALF)}
 """Channels and size of each observation format."""
-_LUMA = (0.299, 0.587, 0.114)
 TEXTURES, PHOTOGRAPHS = "textures", "photographs"
 """Built-in pools."""
 POOL = 1024
 """Maximum images in a pool."""
-_CIFAR_SIDE, _CIFAR_CLASSES = 32, 10
-_CIFAR_BYTES = 3 * _CIFAR_SIDE**2
+_CIFAR_SIDE = 32
 _CROPS = (120, 400)
 """Minimum and maximum side of a photograph's crop in pixels."""
 _DISCS, _RADII, _CONTRAST = 300, (4.0, 60.0), 60.0
@@ -103,20 +101,18 @@ def _textures(rng: np.random.Generator) -> Tensor:
     They have edge and scale statistics of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural
     images").
     """
-    return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
-
-
-def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
-    own = rng.uniform(0, 255) + rng.normal(0, _CONTRAST / 2, 3)
-    image = Image.new("RGB", (PICTURE_SIZE, PICTURE_SIZE), tuple(own.clip(0, 255).astype(int).tolist()))
-    draw = ImageDraw.Draw(image)
-    centres = rng.uniform(0, PICTURE_SIZE, (_DISCS, 2))
-    least, greatest = _RADII
-    radii = least / np.sqrt(1 - rng.random(_DISCS) * (1 - (least / greatest) ** 2))
-    colours = rng.normal(own, _CONTRAST, (_DISCS, 3)).clip(0, 255).astype(int)
-    for (x, y), r, colour in zip(centres.tolist(), radii.tolist(), colours.tolist(), strict=True):
-        draw.ellipse((x - r, y - r, x + r, y + r), fill=tuple(colour))
-    return np.asarray(image)
+    textures, (least, greatest) = [], _RADII
+    for _ in range(POOL):
+        mean = rng.uniform(0, 255) + rng.normal(0, _CONTRAST / 2, 3)
+        image = Image.new("RGB", (PICTURE_SIZE, PICTURE_SIZE), tuple(mean.clip(0, 255).astype(int).tolist()))
+        draw = ImageDraw.Draw(image)
+        centres = rng.uniform(0, PICTURE_SIZE, (_DISCS, 2))
+        radii = least / np.sqrt(1 - rng.random(_DISCS) * (1 - (least / greatest) ** 2))
+        colours = rng.normal(mean, _CONTRAST, (_DISCS, 3)).clip(0, 255).astype(int)
+        for (x, y), r, colour in zip(centres.tolist(), radii.tolist(), colours.tolist(), strict=True):
+            draw.ellipse((x - r, y - r, x + r, y + r), fill=tuple(colour))
+        textures.append(np.asarray(image))
+    return _to_size(np.stack(textures))
 
 
 def _photographs(rng: np.random.Generator) -> Tensor:
@@ -142,8 +138,8 @@ def _files(folder: Path) -> list[Path]:
     """Sorted image files of a folder."""
     with disk_errors(folder):
         files = sorted(path for path in folder.rglob("*") if path.is_file())
-    shown = (path for path in files if not path.name.startswith("."))  # macOS writes ._x.png beside x.png
-    return [path for path in shown if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    visible = (path for path in files if not path.name.startswith("."))  # macOS writes ._x.png beside x.png
+    return [path for path in visible if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
 
 
 def _is_cifar(path: Path) -> bool:
@@ -152,10 +148,9 @@ def _is_cifar(path: Path) -> bool:
 
 def _read_image(path: Path) -> np.ndarray:
     """(1, H, W, 3) uint8 of one PNG or JPEG file."""
+    content = read_bytes(path)
     try:
-        return np.asarray(Image.open(io.BytesIO(read_bytes(path))).convert("RGB"))[None]
-    except UserError:
-        raise
+        return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))[None]
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # raised by Pillow
         raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
 
@@ -167,15 +162,13 @@ def _read_cifar(path: Path) -> np.ndarray:
     found without unpickling.
     """
     content, labels = read_bytes(path), int(path.suffix == ".bin")
-    try:
-        runs = [content] if labels else [a for _, a, _ in genops(content) if isinstance(a, str | bytes)]
-        longest = max(runs, key=len, default=b"")
+    with damaged(path, "is not a CIFAR-10 file", "download CIFAR-10 again"):
+        strings = [content] if labels else [a for _, a, _ in genops(content) if isinstance(a, str | bytes)]
+        longest = max(strings, key=len, default=b"")
         raw = longest.encode("latin-1") if isinstance(longest, str) else longest
-        images = np.frombuffer(raw, np.uint8).reshape(-1, labels + _CIFAR_BYTES)[:POOL]
-        if not len(images) or (labels and images[:, 0].max() >= _CIFAR_CLASSES):
+        images = np.frombuffer(raw, np.uint8).reshape(-1, labels + 3 * _CIFAR_SIDE**2)[:POOL]
+        if not len(images) or (labels and images[:, 0].max() > 9):
             raise ValueError("it holds no images, or labels above 9")
-    except ValueError as error:
-        raise UserError(f"{path}: is not a CIFAR-10 file ({error}); download CIFAR-10 again") from error
     return images[:, labels:].reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
 
 
@@ -188,7 +181,7 @@ def _to_size(images: np.ndarray) -> Tensor:
 
 def to_grey50(pictures: Tensor) -> Tensor:
     """Luminance averaged over 2x2 pixels: (N, 3, 100, 100) uint8 -> (N, 1, 50, 50) uint8."""
-    weights = torch.tensor(_LUMA, device=pictures.device) / 4
+    weights = torch.tensor([0.299, 0.587, 0.114], device=pictures.device) / 4
     return torch.einsum("nchw,c->nhw", _sums(pictures).float(), weights).round_().to(torch.uint8)[:, None]
 
 
@@ -199,5 +192,5 @@ def to_rgb50(pictures: Tensor) -> Tensor:
 
 def _sums(pictures: Tensor) -> Tensor:
     """Sums over 2x2 pixels, int16."""
-    corners = [pictures[..., row::2, column::2].short() for row in (0, 1) for column in (0, 1)]
-    return corners[0] + corners[1] + corners[2] + corners[3]
+    rows = pictures[..., ::2, :].short() + pictures[..., 1::2, :]
+    return rows[..., ::2] + rows[..., 1::2]

@@ -9,8 +9,8 @@ OUT/figures/      accuracy.png, accuracy_raw.png (next to the paper's numbers), 
 
 from __future__ import annotations
 
-import math
 import operator
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -22,11 +22,10 @@ import pandas as pd
 from vd4rl_pomdp.core.text import code, code_block, markdown, table_lines, write_text
 from vd4rl_pomdp.envs.mazes import HARD, MAZES, PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_interval
-from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import RUNS, Result
 from vd4rl_pomdp.studies.navigation import figures
-from vd4rl_pomdp.studies.navigation.measures import (
+from vd4rl_pomdp.studies.navigation.runs import (
     METHOD_NAMES,
     OBJECTIVES,
     RAW_PREFIX,
@@ -34,22 +33,18 @@ from vd4rl_pomdp.studies.navigation.measures import (
     UNTRAINED,
     Condition,
     Measure,
+    NavigationRun,
+    Numbers,
     condition_of,
+    find_navigation,
     held_out_loss,
+    is_missing,
+    load_runs,
+    numbers_of,
     online_error,
     paper_number,
     paper_rows,
     refitted_error,
-)
-from vd4rl_pomdp.studies.navigation.runs import (
-    KEYS,
-    NavigationRun,
-    conditions_of,
-    find_navigation,
-    frame_of,
-    is_missing,
-    load_runs,
-    numbers_of,
     save_runs,
 )
 
@@ -80,64 +75,66 @@ MAIN_TEXT = ("no_curtain", "three_curtains")
 LITERAL = Condition("", "mik+a", 1, literal_future=True)
 
 
-def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
+def make_tables(runs: Sequence[NavigationRun]) -> pd.DataFrame:
     """Cells of the paper's six tables (position and velocity are one of them) and of four of our own.
 
     Returns:
-        `table`, `view` and `row` where the number stands, KEYS, `mean`, `low` and `high` (95% t interval), `seeds` and
-        `of_seeds`, those with which the maze was trained under any condition; the `paper`'s number; and whether it is
-        `missing`, see `is_missing`.
+        `table`, `view` and `row` where the number stands, `maze`, `mean`, `low` and `high` (95% t interval), `seeds`
+        and `of_seeds`, those with which the maze was trained under any condition; the `paper`'s number; and whether it
+        is `missing`, see `is_missing`.
         Rows of a table for which neither a run nor the paper has a number are left out, and tables that no run has.
     """
-    lines, trained, numbers = list(_layout(frame)), conditions_of(frame), numbers_of(frame)
-    cells = pd.DataFrame([(*line[:3], *line[3], *line[4]) for line in lines], columns=["table", "view", "row", *KEYS])
-    cells["paper"] = [paper_number(condition, measure) for _, _, _, condition, measure in lines]
-    cells["missing"] = [is_missing(condition, trained) for _, _, _, condition, _ in lines]
-    found = [list(numbers.get((*line[3], *line[4]), {}).values()) for line in lines]
-    cells["seeds"] = list(map(len, found))
-    cells["of_seeds"] = cells["maze"].map(frame.groupby("maze")["seed"].nunique())
-    cells["mean"] = [np.mean(values) if values else None for values in found]
-    ends = [mean_interval(np.array(values)[:, None]) if values else None for values in found]
-    cells[["low", "high"]] = [end or (None, None) for end in ends]
-    told = (cells["seeds"] > 0) | cells["paper"].notna()
+    trained, numbers, rows = {run.condition for run in runs}, numbers_of(runs), []
+    seeds = Counter(maze for maze, _ in {(run.condition.maze, run.seed) for run in runs})
+    for table, view, row, condition, measure in _layout(runs):
+        values = list(numbers.get((condition, measure), {}).values())
+        low, high = (mean_interval(np.array(values)[:, None]) if values else None) or (None, None)
+        cell: dict[str, Any] = {"table": table, "view": view, "row": row, "maze": condition.maze}
+        cell |= {"mean": np.mean(values) if values else None, "low": low, "high": high, "seeds": len(values)}
+        cell |= {"of_seeds": seeds[condition.maze], "paper": paper_number(condition, measure)}
+        rows.append(cell | {"missing": is_missing(condition, trained)})
+    cells = pd.DataFrame(rows)
+    known = (cells["seeds"] > 0) | cells["paper"].notna()
     of_row = [cells["table"], cells["view"], cells["row"]]
-    return cells[told.groupby(of_row).transform("any") & (cells["seeds"].groupby(of_row[:2]).transform("max") > 0)]
+    return cells[known.groupby(of_row).transform("any") & (cells["seeds"].groupby(of_row[:2]).transform("max") > 0)]
 
 
-def _layout(frame: pd.DataFrame) -> Iterator[tuple[str, str, str, Condition, Measure]]:
+def _layout(runs: Sequence[NavigationRun]) -> Iterator[tuple[str, str, str, Condition, Measure]]:
     """All cells, table by table and row by row: table, view, row, condition and measure."""
-    told, refitted = {condition_of(line, "") for line in paper_rows()}, tuple(_PROTOCOLS)[1]
+    printed, refitted = {condition_of(line, "") for line in paper_rows()}, tuple(_PROTOCOLS)[1]
     references = {method: Condition("", method) for method in REFERENCES}
-    found = frame[list(Condition._fields)].assign(maze="").drop_duplicates().itertuples(index=False, name=None)
-    others = [row for row in map(Condition._make, found) if row not in {*told, *references.values(), LITERAL}]
-    groups: list[tuple[str, str, list[tuple[str, Condition, Measure]]]] = []
+    found = dict.fromkeys(run.condition._replace(maze="") for run in runs)
+    others = [condition for condition in found if condition not in {*printed, *references.values(), LITERAL}]
+    sections: list[tuple[str, str, list[tuple[str, Condition, Measure]]]] = []
     for name in _PAPER_TABLES:
-        printed = [line for line in paper_rows() if line["table"] == name.removesuffix("_main")]
         for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else _PROTOCOLS).items():
             rows = []
-            for line in printed:
+            for line in paper_rows():
+                if line["table"] != name.removesuffix("_main"):
+                    continue
                 what = "action_loss" if name == "action_loss" else f"{line['component']}_error"
                 options = ", self-prediction" if line["self_prediction"] == "Y" else ""
                 label = f"{line['objective']}, K={line['k_max']}{options}"
                 rows.append((label, condition_of(line, ""), Measure(what, split, probe)))
-            groups.append((name, protocol, rows))
+            sections.append((name, protocol, rows))
     errors = [(what, refitted_error(what)) for what in ("state", "position", "velocity")]
     rows = [(f"{name}, {what}", condition, error) for name, condition in references.items() for what, error in errors]
     rows += [
         ("MIK+A, literal future, K=1, state error", LITERAL, refitted_error("state")),
         ("MIK+A, literal future, K=1, action loss", LITERAL, held_out_loss()),
     ]
-    groups.append(("references", refitted, rows))
+    sections.append(("references", refitted, rows))
     hidden = [(what, refitted_error(what, "hidden")) for what in ("position", "velocity")]
     rows = [(f"{name}, {what}", Condition("", name), error) for name in METHOD_NAMES for what, error in hidden]
-    groups.append(("hidden", refitted, rows))
+    sections.append(("hidden", refitted, rows))
     rows = [(f"{name}, k={k}", Condition("", name), held_out_loss(k)) for name in OBJECTIVES for k in (1, 5, 15)]
-    groups.append(("by_k", _REFITTED, rows))
-    groups.append(("others", refitted, [(other.short, other, refitted_error("state")) for other in others]))
-    for table, protocol, rows in groups:
+    sections.append(("by_k", _REFITTED, rows))
+    sections.append(("others", refitted, [(other.short, other, refitted_error("state")) for other in others]))
+    for table, protocol, rows in sections:
         losses = table in ("action_loss", "by_k")
         for raw in (False,) if losses else (False, True):
-            trained = set(frame["maze"][frame["measure"].str.startswith(RAW_PREFIX if raw else "")])
+            prefix = RAW_PREFIX if raw else ""
+            trained = {run.condition.maze for run in runs if any(m.measure.startswith(prefix) for m in run.values)}
             paper = trained & set(PAPER_MAZES)  # all of the paper's mazes if any of them has runs
             mazes = [maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES)]
             if table == "exogenous_main":
@@ -171,18 +168,8 @@ def table_sections(cells: pd.DataFrame) -> Iterator[str]:
         for view, table in mine.groupby("view", sort=False):
             mazes, rows = table["maze"].unique(), table["row"].unique()
             wide = table.pivot(index="row", columns="maze", values="text").loc[rows, mazes]
-            shown = ((label, *row) for label, row in zip(rows, wide.to_numpy(), strict=True))
-            yield from (f"*{view}*", "", *table_lines(["", *mazes], shown, range(len(mazes) + 1)), "")
-
-
-def write_tables(cells: pd.DataFrame, path: Path) -> None:
-    """Write the cells of all tables as CSV."""
-    shown = cells[(cells["seeds"] > 0) | cells["missing"]].copy()
-    for name in ("mean", "low", "high"):
-        shown[name] = ["" if pd.isna(value) else f"{value:.4g}" for value in shown[name]]
-    shown["paper"] = ["" if pd.isna(value) else value for value in shown["paper"]]
-    columns = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
-    write_csv(path, columns, shown[columns].to_dict("records"))
+            cells_of_row = ((label, *row) for label, row in zip(rows, wide.to_numpy(), strict=True))
+            yield from (f"*{view}*", "", *table_lines(["", *mazes], cells_of_row, range(len(mazes) + 1)), "")
 
 
 NEAR_ZERO = 5.0
@@ -191,8 +178,6 @@ FEW = 15.0
 """State error (% of a standard deviation) below which a first-person agent counts as localised."""
 _RELATIONS = {">=": operator.ge, "<=": operator.le, "<": operator.lt, ">": operator.gt}
 ClaimSide = tuple[Condition, Measure]
-Numbers = Mapping[tuple[Any, ...], Mapping[int, float]]
-"""Output of `numbers_of`."""
 
 
 class Claim(NamedTuple):
@@ -223,24 +208,15 @@ class Claim(NamedTuple):
 class Verdict(NamedTuple):
     """A claim with the runs' numbers."""
 
-    claim: Claim
-    left: float
-    right: float
-    """Means over seeds that have both numbers; NaN if there are none."""
     seeds: int
+    """Seeds that have both numbers."""
     seeds_holding: int
+    holds: bool
+    """Whether the claim holds for the means over seeds."""
+    cells: list[str]
+    """Both means, and whether it holds for them, as a table shows them; dashes without seeds."""
     paper: tuple[float, float] | None
     """The paper's two numbers, if it has both and the claim is in its units."""
-
-    @property
-    def holds(self) -> bool:
-        """Whether the claim holds for the means."""
-        return self.seeds > 0 and self.claim.holds(self.left, self.right)
-
-    @property
-    def words(self) -> list[str]:
-        """Both means, and whether it holds for them, as a table shows them."""
-        return [self.claim.words(self.left, self.right), "**yes**" if self.holds else "**no**"]
 
 
 def claims(maze: str) -> list[Claim]:
@@ -271,8 +247,8 @@ def claims(maze: str) -> list[Claim]:
             Claim("ah's state error, of mik+a's", of("ah", "state"), ">", 1, of("mik+a", "state")),
         ]
     if MAZES[maze].paper == "first_person":  # the position is known by far where one image does not reveal it
-        for told, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
-            ours = of("mik+a", "state", self_prediction=told)
+        for trained_so, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
+            ours = of("mik+a", "state", self_prediction=trained_so)
             found += [
                 Claim(f"state error of {name}, of the untrained one's", ours, "<", 0.5, of(UNTRAINED, "state")),
                 Claim(f"state error of {name}", ours, "<", FEW),
@@ -289,56 +265,58 @@ def claims(maze: str) -> list[Claim]:
 
 def judge(claim: Claim, numbers: Numbers) -> Verdict:
     """Evaluate a claim over the seeds that both sides have."""
-    left = numbers.get((*claim.left[0], *claim.left[1]), {})
-    right = numbers.get((*claim.right[0], *claim.right[1]), {}) if claim.right else dict.fromkeys(left, 1.0)
+    left = numbers.get(claim.left, {})
+    right = numbers.get(claim.right, {}) if claim.right else dict.fromkeys(left, 1.0)
     seeds = sorted(left.keys() & right.keys())
-    holding = sum(claim.holds(left[seed], right[seed]) for seed in seeds)
-    means = [sum(side[seed] for seed in seeds) / len(seeds) if seeds else math.nan for side in (left, right)]
+    holds, cells = False, ["-", "-"]
+    if seeds:
+        means = [sum(side[seed] for seed in seeds) / len(seeds) for side in (left, right)]
+        holds = claim.holds(*means)
+        cells = [claim.words(*means), "**yes**" if holds else "**no**"]
     paper = paper_number(*claim.left), paper_number(*claim.right) if claim.right else 1.0
     known = None if paper[0] is None or paper[1] is None else (paper[0], paper[1])
-    return Verdict(claim, means[0], means[1], len(seeds), holding, known)
+    return Verdict(len(seeds), sum(claim.holds(left[seed], right[seed]) for seed in seeds), holds, cells, known)
 
 
-def verdict_lines(frame: pd.DataFrame) -> list[str]:
+def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
     """A report section: the claims about all mazes with runs, whether they hold, and the paper's numbers."""
-    numbers, mazes = numbers_of(frame), set(frame["maze"])
-    pairs = [
-        (maze, judge(claim, numbers), judge(claim.raw(), numbers))
+    numbers, trained = numbers_of(runs), {run.condition.maze for run in runs}
+    found = [
+        (maze, claim, judge(claim, numbers), judge(claim.raw(), numbers))
         for maze in MAZES
-        if maze in mazes
+        if maze in trained
         for claim in claims(maze)
     ]
-    judged = [percent for _, percent, _ in pairs if percent.seeds]
-    printed = [raw for _, _, raw in pairs if raw.seeds and raw.paper]
-    both = [(maze, percent, raw) for maze, percent, raw in pairs if raw.seeds and raw.claim != percent.claim]
-    other = [f"{maze}: {percent.claim.text}" for maze, percent, raw in both if percent.holds != raw.holds]
+    rows = []
+    for maze, claim, percent, raw in found:
+        columns = [maze, f"{claim.text} {claim.relation} {claim.factor:g}{' x' if claim.right else ''}"]
+        if percent.seeds:
+            columns += [*percent.cells, f"{percent.seeds_holding} of {percent.seeds}"]
+        else:
+            columns += ["no run yet", "-", "-"]
+        columns += ["no error", "-"] if claim.raw() == claim else raw.cells
+        if raw.paper:
+            columns.append(f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}")
+        else:
+            columns.append("none")
+        rows.append(columns)
+    judged = [percent.holds for _, _, percent, _ in found if percent.seeds]
+    printed = [raw.holds for *_, raw in found if raw.seeds and raw.paper]
+    both = [row for row in found if row[-1].seeds and row[1].raw() != row[1]]
+    other = [f"{maze}: {claim.text}" for maze, claim, percent, raw in both if percent.holds != raw.holds]
     changes = f"{len(other)} change ({'; '.join(other)})" if other else "none changes"
     of_ah = {maze: paper_number(Condition(maze, "ah+a"), online_error("position").raw()) for maze in MAZES}
     recorder = ", ".join(f"{number:.1f} ({maze})" for maze, number in of_ah.items() if number is not None)
-    lines = [
+    head = ["maze", "statement", "here, % of std", "holds", "seeds", "here, raw x 100", "holds", "the paper's numbers"]
+    return [
         "## Which statements hold",
         "",
-        f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(pairs) - len(judged)} wait for runs. "
+        f"{sum(judged)} of {len(judged)} hold, {len(found) - len(judged)} wait for runs. "
         f"Of {len(both)} that are judged in both units, {changes}.",
         "Wording and bounds are this package's. "
-        f"Of those for which the paper prints numbers, {sum(v.holds for v in printed)} of {len(printed)} hold.",
+        f"Of those for which the paper prints numbers, {sum(printed)} of {len(printed)} hold.",
         "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds` says how many hold alone.",
         "",
-    ]
-    head = ["maze", "statement", "here, % of std", "holds", "seeds", "here, raw x 100", "holds", "the paper's numbers"]
-    rows = []
-    waiting = ["no run yet", "-", "-"]
-    for maze, percent, raw in pairs:
-        claim = percent.claim
-        columns = [maze, f"{claim.text} {claim.relation} {claim.factor:g}{' x' if claim.right else ''}"]
-        columns += [*percent.words, f"{percent.seeds_holding} of {percent.seeds}"] if percent.seeds else waiting
-        columns += ["no error", "-"] if raw.claim == claim else raw.words if raw.seeds else ["-", "-"]
-        columns.append(
-            f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}" if raw.paper else "none"
-        )
-        rows.append(columns)
-    return [
-        *lines,
         *table_lines(head, rows, range(len(head))),
         "",
         "That ah+a beats the untrained encoder is not to be expected: it reads an action from its record of past ones",
@@ -382,36 +360,34 @@ cells: `vd4rl-pomdp sweep run GRID --out runs --dry-run`.
 
 
 def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = None) -> Path:
-    """Write the report of all runs in `sources` to `out`; returns the page.
-
-    Args:
-        sources: run folders, results folders, or folders that contain some.
-        out: output folder.
-        samples: renders sample observations, which needs OpenGL; None leaves them out.
-    """
+    """Write the report of all runs in `sources` (run folders, results folders, or folders that contain some) to `out`;
+    returns the page. Without `samples`, which need OpenGL, no sample observations are drawn."""
     refuse_foreign(out, "navigation report", RUNS)
     found = find_navigation(sources, out)
     runs, unfinished = load_runs(found), [result for result in found if not result.finished]
     drawn = samples() if samples is not None else None  # before anything is written, since OpenGL may be missing
     with owned(out):
         save_runs(runs, out)
-        frame, state, folder = frame_of(runs), refitted_error("state"), out / "figures"
+        state, folder = refitted_error("state"), out / "figures"
         folder.mkdir(exist_ok=True)
-        shown = {
-            "accuracy.png": figures.accuracy_bars(frame, state, folder / "accuracy.png"),
-            "accuracy_raw.png": figures.accuracy_bars(frame, state.raw(), folder / "accuracy_raw.png"),
+        written = {
+            "accuracy.png": figures.accuracy_bars(runs, state, folder / "accuracy.png"),
+            "accuracy_raw.png": figures.accuracy_bars(runs, state.raw(), folder / "accuracy_raw.png"),
             "trajectories.png": figures.trajectories(runs, folder / "trajectories.png"),
             "observations.png": drawn and figures.observations(drawn, folder / "observations.png"),
         }
-        cells = make_tables(frame)
-        write_tables(cells, out / "tables.csv")
-        lines = [*_head(runs, unfinished), *verdict_lines(frame)]
-        for name in filter(shown.get, shown):
+        cells = make_tables(runs)
+        filled = cells[(cells["seeds"] > 0) | cells["missing"]]
+        numbers = filled[["mean", "low", "high"]].map(lambda value: "" if pd.isna(value) else f"{value:.4g}")
+        columns = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
+        filled.assign(**numbers)[columns].to_csv(out / "tables.csv", index=False, lineterminator="\n")
+        lines = [*_head(runs, unfinished), *verdict_lines(runs)]
+        for name in filter(written.get, written):
             lines += [f"![{_CAPTIONS[name][0]}](figures/{name})", "", _CAPTIONS[name][1], ""]
         lines += [*table_sections(cells), _COMMANDS]
         commands = [(run, run.result.files["results"]["command"], run.result.files["timing"]) for run in runs]
-        told = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
-        lines += code_block(told, "bash")
+        shell = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
+        lines += code_block(shell, "bash")
         write_text(out / "report.md", "\n".join(lines) + "\n")
     return out / "report.md"
 
@@ -452,8 +428,8 @@ def _head(runs: list[NavigationRun], unfinished: list[Result]) -> list[str]:
                 unlike.append(f"Not alike in {code(maze)}: {name} is {found[0]}, but {'; '.join(where)}.  ")
     lines += [*unlike, ""] if unlike else []
     lines += [_HARD] if any(MAZES[run.condition.maze].style is HARD for run in runs) else []
-    told = {run.condition.maze: run.result.record["config"]["exogenous"] for run in runs if run.condition.exogenous}
-    images = [f"{markdown(name)} in {code(maze)}" for maze, name in told.items()]
+    sources = {run.condition.maze: run.result.record["config"]["exogenous"] for run in runs if run.condition.exogenous}
+    images = [f"{markdown(name)} in {code(maze)}" for maze, name in sources.items()]
     lines += [f"Exogenous noise adds {', '.join(images)}.", ""] if images else []
     for result in unfinished:
         of = result.record["config"].get("steps", "?")

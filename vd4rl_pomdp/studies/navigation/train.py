@@ -10,7 +10,6 @@ deviation, where predicting the mean gives about 65 to 100, and the simulator's 
 
 from __future__ import annotations
 
-import csv
 import math
 import shlex
 from collections import defaultdict
@@ -18,18 +17,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 from torch import Tensor, nn
 
 from pretrain.build import build_objective, build_target
 from pretrain.train import Trainer
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat, settings_of
 from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.streams import random_stream
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data import WindowSampler
+from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.folder import read_plan
+from vd4rl_pomdp.envs.mazes import MAZES, PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.nn.heads import mlp
@@ -41,15 +43,99 @@ from vd4rl_pomdp.runs.files import replacing_file, write_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
-from vd4rl_pomdp.studies.navigation.data import MazeData
-from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure
-from vd4rl_pomdp.studies.navigation.pictures import SHAPES
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions, command_of
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, source_fingerprint, to_grey50, to_rgb50
+from vd4rl_pomdp.studies.navigation.runs import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure
+
+HELD_OUT = 10
+"""One in this many trajectories, the last ones, is held out."""
+
+
+class MazeView(View):
+    """Observations of a maze's dataset: one image per row, with the exogenous noise of its key."""
+
+    def __init__(self, dataset: Dataset, noise: ExogenousNoise | None) -> None:
+        super().__init__(dataset, frame_stack=1)
+        self._noise = noise
+
+    def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
+        """Observations (N, ..., 3, 100, 100) uint8 of (N, ...) int64 rows."""
+        pictures = super().observe(rows, shift_key)
+        if self._noise is None:
+            return pictures
+        noisy = self._noise(pictures.flatten(0, -4), self.dataset.keys(rows).flatten())
+        return noisy.view(pictures.shape)
+
+
+class MazeData:
+    """Batches of a maze's dataset: the last tenth of the trajectories is held out, the others are for training."""
+
+    def __init__(self, config: NavigationConfig, cache: Path | None = None) -> None:
+        """Open the config's dataset, with its exogenous noise, on the CPU; UserError if it does not fit."""
+        dataset, again = open_dataset(config.data, cache), "collect a dataset with `vd4rl-pomdp navigation collect`"
+        names = {stored.get("task") for stored in dataset.store.meta["attributes"]}
+        lengths = dataset.episode_end - dataset.episode_start
+        single = f"trajectory {int(lengths.argmin())} is a single row, without a step"
+        for wrong, what in (
+            (len(names) != 1 or not names <= set(MAZES), f"names no maze; {again}"),
+            (dataset.frame_size != PICTURE_SIZE, f"has frames of {dataset.frame_size} pixels, mazes of 100; {again}"),
+            (dataset.physics is None, f"holds no true states ('physics'), which the probe needs; {again}"),
+            (len(lengths) < 2, "a single trajectory leaves none to hold out; collect more --trajectories"),
+            (lengths.min() < 2, f"{single}; remove it, or collect the dataset again"),
+        ):
+            if wrong:
+                raise UserError(f"{config.data}: {what}")
+        self.dataset, self.maze, self._config = dataset, MAZES[names.pop()], config
+        self.first_held_out = dataset.num_episodes - max(1, dataset.num_episodes // HELD_OUT)
+        split = int(dataset.episode_start[self.first_held_out])
+        assert dataset.physics is not None
+        raw = torch.from_numpy(dataset.physics[:, self.maze.position + self.maze.velocity])
+        std, mean = torch.std_mean(raw[:split], dim=0)
+        self.states, self.mean, self.std = ((raw - mean) / std).float(), mean.float(), std.float()
+        """(N, 4) float32 states of all rows, standardised by mean and std (4,) of the training rows."""
+        self.hidden = torch.from_numpy(self.maze.hidden(dataset.physics))
+        """(N,) bool: a curtain covers the whole mass."""
+        rows = dataset.transition_rows
+        self.training_actions = dataset.action_after(rows[rows < split])
+        """(M, 2) float32."""
+        self.total = dataset.num_windows(config.window)
+        self.training = int(dataset.windows_per_episode(config.window)[: self.first_held_out].sum())
+        """Windows 0..training-1 are for training, the others are held out."""
+        self.inputs = {"data": dataset.fingerprint}
+        """Fingerprints of a run's inputs by name."""
+        noise = None
+        if isinstance(config.noise, NoiseOptions):
+            noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
+            self.inputs["exogenous"] = source_fingerprint(config.exogenous)
+        self.view: View = MazeView(dataset, noise)
+
+    def on(self, device: torch.device) -> MazeData:
+        """Prepare the observations and move everything to a device."""
+        if self._config.picture != "rgb100":  # shrunk once, so that training never touches the large images
+            shrink = {"grey50": to_grey50, "rgb50": to_rgb50}[self._config.picture]
+            channels, size = SHAPES[self._config.picture]
+            small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
+            for rows in torch.arange(self.dataset.num_rows).split(1000):
+                small[rows] = shrink(self.view.observe(rows))
+            self.dataset.frames, self.view = small, View(self.dataset, frame_stack=1)
+        self.dataset.to(device)
+        for name in ("states", "hidden", "mean", "std"):
+            setattr(self, name, getattr(self, name).to(device))
+        return self
+
+    def windows(self, number: Tensor, length: int | None = None) -> Windows:
+        """Windows by (B,) numbers, as observed by the model."""
+        return self.view.windows(number, length or self._config.window)
+
+    def spread(self, count: int, held_out: bool) -> list[Tensor]:
+        """Numbers of `count` windows, evenly spaced over the training or held-out ones, in batches."""
+        first, last = (self.training, self.total) if held_out else (0, self.training)
+        numbers = torch.linspace(first, last - 1, min(count, last - first)).long()
+        return list(numbers.split(self._config.batch_size))
+
 
 STATE_DIM = 4
 COMPONENTS = {"state": slice(0, 4), "position": slice(0, 2), "velocity": slice(2, 4)}
-_BATCH = 1024
-_LEARNING_RATE = 1e-3
 
 
 class StateProbe(nn.Module):
@@ -86,11 +172,6 @@ class ErrorSums(nn.Module):
         self.sums.add_((weights @ error).double())
         self.counts.add_(weights.sum(1).double())
 
-    def reset(self) -> None:
-        """Reset to zero."""
-        self.sums.zero_()
-        self.counts.zero_()
-
     def both(self, std: Tensor) -> dict[str, float]:
         """`state`, `position`, `velocity` in percent of `std` (4,); with suffix `_hidden` if a counted row was hidden;
         and all of them with RAW_PREFIX in the simulator's units x 100."""
@@ -109,11 +190,11 @@ def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
     seed_networks(seed, "refit")
     probe = StateProbe(features.shape[1]).to(features.device)
     probe.standardise.fit(features)
-    optimiser = torch.optim.Adam(probe.parameters(), lr=_LEARNING_RATE)
+    optimiser = torch.optim.Adam(probe.parameters(), lr=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     generator = stream_generator(seed, "refit", "batches")
     for _ in range(steps):
-        rows = torch.randint(len(features), (_BATCH,), generator=generator).to(features.device, non_blocking=True)
+        rows = torch.randint(len(features), (1024,), generator=generator).to(features.device, non_blocking=True)
         loss = (probe(features[rows]) - truth[rows]).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -122,8 +203,6 @@ def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
     return probe.eval()
 
 
-_SUPERVISED_RATE = 0.5
-"""Factor on the learning rate of supervised references; without it, two of three seeds predict the mean."""
 STAGE = "navigation"
 
 
@@ -180,7 +259,8 @@ class ProbedObjective(Objective):
     def take_errors(self) -> dict[str, float]:
         """Mean errors since the last call."""
         found = self.errors.both(self.data.std)
-        self.errors.reset()
+        self.errors.sums.zero_()
+        self.errors.counts.zero_()
         return found
 
 
@@ -203,10 +283,10 @@ def make_trainer(data: MazeData, config: NavigationConfig, device: torch.device)
 def learning_rate(config: NavigationConfig, step: int) -> float:
     """Adam's learning rate at a step, counted from 0."""
     rising = min(1.0, (step + 1) / config.warm_up) if config.warm_up else 1.0
-    share = max(0, step - config.warm_up) / max(1, config.steps - config.warm_up)
-    falling = (1 + math.cos(math.pi * share)) / 2 if config.schedule == "cosine" else 1.0
-    share_taken = _SUPERVISED_RATE if config.method in SUPERVISED else 1.0
-    return config.learning_rate * rising * falling * share_taken
+    fraction = max(0, step - config.warm_up) / max(1, config.steps - config.warm_up)
+    falling = (1 + math.cos(math.pi * fraction)) / 2 if config.schedule == "cosine" else 1.0
+    # without the factor, two of three seeds of a supervised reference predict the mean
+    return config.learning_rate * rising * falling * (0.5 if config.method in SUPERVISED else 1.0)
 
 
 TRAJECTORY_ROWS = 200
@@ -219,14 +299,14 @@ def train(config: NavigationConfig) -> RunFolder:
     refuse_inside(config.out)
     data = MazeData(config)
     trainer, probed = make_trainer(data, config, pick_device(config.device))
-    labels, results = (
-        {"method": config.method, "task": data.maze.name},
-        (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN),
-    )
-    with RunFolder(config.out, STAGE, config, data.inputs, results, collection=read_plan(config.data)) as run:
+    labels, results = {"method": config.method, "task": data.maze.name}, [NAVIGATION_FILE, TRAJECTORY_FILE]
+    with RunFolder(
+        config.out, STAGE, config, data.inputs, (*results, *FILES_OF_RUN), collection=read_plan(config.data)
+    ) as run:
         if not run.finished:
             steps, last_averaged = 0 if config.method == UNTRAINED else config.steps, config.steps - config.average_last
-            trainer.run(run, steps, " ".join(reversed(labels.values())), labels, probed.take_errors, last_averaged)
+            title = f"{data.maze.name} {config.method}"
+            trainer.run(run, steps, title, labels, probed.take_errors, last_averaged)
             trained, frames = run.seconds, trainer.step * config.batch_size * config.window
             probe, rows = measure(probed, run.path / METRICS_FILE)
             write_trajectory(run.path / TRAJECTORY_FILE, probed, probe)
@@ -242,11 +322,11 @@ def train(config: NavigationConfig) -> RunFolder:
                 settings=settings_of(run.config),
             )
             save_encoder(run.path / "encoder", probed.encoder, card, frames)
-            told = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
-            write_json(run.path / NAVIGATION_FILE, told | {"rows": rows})
-            run.finish(
-                seconds=round(trained, 2), steps=trainer.step, frames=frames, total_seconds=round(run.seconds, 2)
-            )
+            record: dict[str, Any] = {"maze": data.maze.name, "set": data.dataset.fingerprint}
+            record |= {"command": shlex.join(command_of(config)), "rows": rows}
+            write_json(run.path / NAVIGATION_FILE, record)
+            seconds = {"seconds": round(trained, 2), "total_seconds": round(run.seconds, 2)}
+            run.finish(steps=trainer.step, frames=frames, **seconds)
     return run
 
 
@@ -300,7 +380,16 @@ def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[s
     found = [(split, "refit", errors) for split, errors in refitted.items()]
     if probed.config.method != UNTRAINED:  # neither its online probe nor its action head was trained
         losses, online = evaluate(probed)
-        averages = _training_averages(log, probed.config)
+        # means over the last `average_last` steps, in which each logged row counts by its steps
+        sums, counts = defaultdict[str, float](float), defaultdict[str, float](float)
+        before: float = max(0, probed.config.steps - probed.config.average_last)
+        for row in read_metrics(log):
+            if row["step"] > before:
+                for name, value in row.items():
+                    sums[name] += value * (row["step"] - before)
+                    counts[name] += row["step"] - before
+                before = row["step"]
+        averages = {name: total / counts[name] for name, total in sums.items()}
         found += [("held_out", "online", online), ("training", "online", averages)]
         if "action_loss" in losses:
             found += [("training", "", averages), ("held_out", "", losses)]
@@ -316,20 +405,6 @@ def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[s
     return probe, [measure._asdict() | {"value": value} for measure, value in values.items()]
 
 
-def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
-    """Logged metrics averaged over the last `average_last` steps, weighting each row by its steps."""
-    before: float = max(0, config.steps - config.average_last)
-    sums: dict[str, float] = defaultdict(float)
-    counts: dict[str, float] = defaultdict(float)
-    for row in read_metrics(path):
-        if row["step"] > before:
-            for name, value in row.items():
-                sums[name] += value * (row["step"] - before)
-                counts[name] += row["step"] - before
-            before = row["step"]
-    return {name: total / counts[name] for name, total in sums.items()}
-
-
 def write_trajectory(path: Path, probed: ProbedObjective, probe: StateProbe) -> None:
     """Write true and estimated states of the first held-out trajectory, encoded as one sequence."""
     data, dataset = probed.data, probed.data.dataset
@@ -337,10 +412,8 @@ def write_trajectory(path: Path, probed: ProbedObjective, probe: StateProbe) -> 
     first = int(dataset.windows_per_episode(length)[: data.first_held_out].sum())
     past, rows = encode(probed, torch.tensor([first]), length)
     estimate, truth = ((z * data.std + data.mean).cpu() for z in (probe(past)[0].detach(), data.states[rows[0]]))
-    with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        names = ("x", "y", "vx", "vy")
-        writer.writerow(["t", *names, *(f"estimated_{name}" for name in names), "hidden"])
-        for t, hidden in enumerate(data.hidden[rows[0]].tolist()):
-            numbers = [*truth[t].tolist(), *estimate[t].tolist()]
-            writer.writerow([t, *(f"{number:.5f}" for number in numbers), int(hidden)])
+    names = ["x", "y", "vx", "vy", *(f"estimated_{name}" for name in ("x", "y", "vx", "vy"))]
+    table = pd.DataFrame(torch.cat([truth, estimate], 1).double().numpy(), columns=names)
+    table["hidden"] = data.hidden[rows[0]].int().cpu()
+    with replacing_file(path) as fresh:
+        table.to_csv(fresh, index_label="t", float_format="%.5f", lineterminator="\r\n")

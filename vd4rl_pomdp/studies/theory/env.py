@@ -89,9 +89,9 @@ class ExactWindows:
 def exact_windows(world: World, rows: int) -> ExactWindows:
     """All sequences from a world's initial distribution; windows end within their episode, as in training."""
     law = joint_law(world, [(kind, j) for kind in ("s", "o", "a") for j in range(rows)])
-    shown, acted, state = (np.stack([law.column((kind, j)) for j in range(rows)], axis=1) for kind in ("o", "a", "s"))
-    obs = torch.from_numpy(255 * np.eye(len(world.symbols), dtype=np.uint8)[shown])
-    action = torch.from_numpy(np.eye(len(world.actions), dtype=np.float32)[acted])
+    symbol, choice, state = (np.stack([law.column((kind, j)) for j in range(rows)], axis=1) for kind in ("o", "a", "s"))
+    obs = torch.from_numpy(255 * np.eye(len(world.symbols), dtype=np.uint8)[symbol])
+    action = torch.from_numpy(np.eye(len(world.actions), dtype=np.float32)[choice])
     count = len(law.counts)
     windows = Windows(
         obs=obs[..., None, None],

@@ -57,8 +57,8 @@ class Law:
 
     def tells(self, group: Iterable[Variable], value: Iterable[Variable]) -> bool:
         """Whether a group of variables determines others."""
-        (ids, first), (told, _) = self.numbered(group), self.numbered(value)
-        return bool((told == told[first][ids]).all())
+        (ids, first), (values, _) = self.numbered(group), self.numbered(value)
+        return bool((values == values[first][ids]).all())
 
     def column(self, variable: Variable) -> np.ndarray:
         """(N,) int32: codes of one variable."""

@@ -17,10 +17,11 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, first_row
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, ObjectiveView, first_row
 from vd4rl_pomdp.studies.theory.law import Law, Prediction, Variable, joint_law, number_rows
-from vd4rl_pomdp.studies.theory.views import ObjectiveView
 from vd4rl_pomdp.studies.theory.world import World
 
 History = tuple
@@ -55,16 +56,13 @@ class Relation:
     def add_facts(self, law: Law, past: Iterable[Variable], content: Iterable[Variable], row: int) -> None:
         """Record the possible states, exogenous states and contents of histories that end at a row.
 
-        Args:
-            law: of `past`, `content` and the s and xi of `row`.
-            past: variables of the histories.
-            content: their agent-centric content: the states of their rows, and their actions.
-            row: their last row.
+        `law` has the variables `past` of the histories, their agent-centric `content` (the states of their rows, and
+        their actions), and the s and xi of `row`.
         """
         history = _numbers(self.histories, past, law)
-        told = {kind: law.column((kind, row)) for kind in ("s", "xi")}
-        told["content"] = _numbers(self._contents, content, law)
-        for kind, values in told.items():
+        columns = {kind: law.column((kind, row)) for kind in ("s", "xi")}
+        columns["content"] = _numbers(self._contents, content, law)
+        for kind, values in columns.items():
             self.facts[kind].append(np.unique(np.stack([history, values], axis=1), axis=0))
         numbers, first = np.unique(history, return_index=True)
         acted = law.values([v for v in past if v[0] == "a"], first)
@@ -251,12 +249,6 @@ def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
 def _linked(pairs: np.ndarray) -> np.ndarray:
     """Connected components of the left numbers of (P, 2) pairs, linked by equal right numbers."""
     left, right = pairs.T
-    label = np.arange(int(left.max()) + 1)
-    while True:
-        lowest = np.full(int(right.max()) + 1, len(label))
-        np.minimum.at(lowest, right, label[left])
-        linked = label.copy()
-        np.minimum.at(linked, left, lowest[right])
-        if (linked == label).all():
-            return np.unique(label, return_inverse=True)[1]
-        label = linked
+    size, width = int(left.max()) + 1, int(right.max()) + 1
+    links = coo_array((np.ones(len(left)), (left, size + right)), shape=(size + width, size + width))
+    return connected_components(links, directed=False)[1][:size]

@@ -4,13 +4,13 @@ worlds."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import asdict
+from fractions import Fraction
 from itertools import product
 from typing import Any
 
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash, compare
+from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths, clash, compare
 from vd4rl_pomdp.studies.theory.partition import (
     Relation,
     discards_noise,
@@ -19,7 +19,6 @@ from vd4rl_pomdp.studies.theory.partition import (
     state_classes,
     state_relation,
 )
-from vd4rl_pomdp.studies.theory.views import VIEWS
 from vd4rl_pomdp.studies.theory.world import (
     WORLDS,
     Action,
@@ -58,8 +57,11 @@ def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Actio
     return found
 
 
-def examples_by_k(world: World) -> list[dict[str, int]]:
-    """One row per k: number of examples and state pairs, and of pairs with a certain or uniform first action."""
+def enumerated(world: World) -> dict[str, Any]:
+    """Enumeration of the counterexample with one of the paper's two action sets.
+
+    `by_k` has one row per k: number of examples and state pairs, and of pairs with a certain or uniform first action.
+    """
     rows = []
     for k in range(1, MAX_K + 1):
         first: dict[tuple[AgentState, AgentState], Counter[Action]] = {}
@@ -69,12 +71,6 @@ def examples_by_k(world: World) -> list[dict[str, int]]:
         uniform = sum(len({counts[a] for a in world.actions}) == 1 for counts in first.values())
         examples = sum(counts.total() for counts in first.values())
         rows.append({"k": k, "examples": examples, "pairs": len(first), "certain": certain, "uniform": uniform})
-    return rows
-
-
-def enumerated(world: World) -> dict[str, Any]:
-    """Enumeration of the counterexample with one of the paper's two action sets."""
-    rows = examples_by_k(world)
     return {
         "actions": list(world.actions),
         "by_k": rows,
@@ -113,7 +109,7 @@ def facts() -> list[Row]:
         `computed`, all text.
     """
     theirs, main = counterexample(), counterexample((0, 1))
-    third, even = examples_by_k(theirs)[2], ", ".join(map(str, enumerated(main)["uniform_k"]))
+    third, even = enumerated(theirs)["by_k"][2], ", ".join(map(str, enumerated(main)["uniform_k"]))
     informative = f"{third['pairs'] - third['uniform']} of {third['pairs']}"
     found: list[tuple[str, str, list[tuple[str, str, str, str]]]] = [
         (
@@ -245,10 +241,11 @@ DIAGRAMS = (("fj", 3), ("fj+a", 3), ("fj+a", 5), ("mik+a", 3), ("mik+a literal",
 
 def theory_study() -> dict[str, Any]:
     """Compute counterexample, Table 1, equations, facts and merged states, JSON-serialisable."""
-    results = {name: _of_world(name, make()) for name, make in WORLDS.items()}
-    described = {name: told for name, (told, _, _) in results.items()}
-    rows = [row for _, found, _ in results.values() for row in found]
-    needs = [row for _, _, found in results.values() for row in found]
+    described, rows, needs = dict[str, Row](), list[Row](), list[Row]()
+    for name, make in WORLDS.items():
+        described[name], compared, needed = _of_world(name, make())
+        rows += compared
+        needs += needed
     tables = {name: [method_row(name, method, rows, needs) for method in METHODS] for name in WORLDS}
     equations = compare_equations(rows, {name: row["m"] for name, row in described.items()})
     world = counterexample()
@@ -305,12 +302,12 @@ def _of_world(name: str, world: World) -> tuple[Row, list[Row], list[Row]]:
         noisy = relation(variant[True, biased], VIEWS[method], memory, range(1, reach + 1))
         for max_k in sorted({reach, reach if VIEWS[method].past == "all" else most}):
             found = relation(variant[False, biased], VIEWS[method], memory, range(1, max_k + 1))
-            shares = forced_shares(found).values()
-            forced = sum(share == 1 for share in shares)
+            shares = list(forced_shares(found).values())
+            forced, pairs = shares.count(Fraction(1)), len(shares)
             needs.append(
                 {"world": name, "state_dependent": biased, "method": method, "max_k": max_k}
                 | {"forced": forced, "sometimes_forced": sum(share > 0 for share in shares)}
-                | {"pairs": len(shares), "complete": forced == len(shares)}
+                | {"pairs": pairs, "complete": forced == pairs}
                 | {"discards": discards_noise(found) and discards_noise(noisy)}
             )
     return described, rows, needs
@@ -336,11 +333,6 @@ def method_row(world: str, method: str, rows: list[Row], needs: list[Row]) -> Ro
     }
 
 
-RANGES: dict[str, Callable[[int, int], bool]] = {
-    "every k": lambda k, m: True,
-    "k > m": lambda k, m: k > m,
-    "k <= m": lambda k, m: k <= m,
-}
 FORMS = {"multi_step": INVERSE, "one_step": "P(a_t | s_t, s_{t+1})", "certain": "1"}
 EQUATIONS = (
     ("ah", "every k", "one_step"),
@@ -355,14 +347,16 @@ EQUATIONS = (
     ("mik+a", "every k", "multi_step"),
     ("mik+a literal", "every k", "multi_step"),
 )
-"""Closed forms of classifiers in section 3.1: a method, one of RANGES, and one of FORMS (fields of `Comparison`)."""
+"""Closed forms of classifiers in section 3.1: a method, a range of k, and one of FORMS (fields of `Comparison`)."""
 
 
 def compare_equations(rows: list[Row], memories: dict[str, int]) -> list[Row]:
     """For every equation and world: the k at which it holds or fails, and whether its assumptions are met."""
     found = []
     for (method, where, form), (world, m) in product(EQUATIONS, memories.items()):
-        mine = [row for row in rows if (row["world"], row["method"]) == (world, method) and RANGES[where](row["k"], m)]
+        mine = [row for row in rows if (row["world"], row["method"]) == (world, method)]
+        if where != "every k":
+            mine = [row for row in mine if (row["k"] > m) == (where == "k > m")]
         fails = {row["k"] for row in mine if not row[form]}
         label = {"method": method, "where": where, "form": form, "world": world, "m": m}
         decodes = all(row["decodes_past"] and row["decodes_end"] for row in mine)
@@ -384,8 +378,8 @@ def differences(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]
                 "complete": f"{row['forced']} of {row['pairs']} pairs of states are always separated",
                 "discards": "the past's code must carry part of the exogenous state",
             }
-            told = PRINTED[row["method"].removesuffix(" literal")]  # literal readings share it
-            failed = [column for column in computed if told[column] and not row[column]]
+            printed = PRINTED[row["method"].removesuffix(" literal")]  # literal readings share it
+            failed = [column for column in computed if printed[column] and not row[column]]
             found += [(world, row["method"], column, computed[column]) for column in failed]
     for row in (row for row in equations if row["fails_k"] and row["decodes"]):
         text = f"{FORMS[row['form']]} for {row['where']}"

@@ -367,5 +367,10 @@ def biased(world: World) -> World:
 
 def variants(world: World) -> dict[tuple[bool, bool], World]:
     """The world with (noise, state-dependent policy) off and on."""
-    shown = noisy(world)
-    return {(False, False): world, (True, False): shown, (False, True): biased(world), (True, True): biased(shown)}
+    with_noise = noisy(world)
+    return {
+        (False, False): world,
+        (True, False): with_noise,
+        (False, True): biased(world),
+        (True, True): biased(with_noise),
+    }
