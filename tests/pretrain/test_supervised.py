@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 import torch
 
+from finetune.features import FrozenEncoder
 from pretrain.objectives import METHODS
 from pretrain.train import make_batches, make_objective
-from tests.helpers_data import fake_action, frame_identity, write_fake_set
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import fake_action, fake_rows, frame_identity, write_fake_set
 from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.types import StateWindows, Windows
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.objective import Objective
+from vd4rl_pomdp.nn.probes import probe_state
+from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.methods import ROWS, build, windows
 
@@ -150,3 +157,44 @@ def test_a_set_without_states_or_with_one_only_is_refused_in_a_line(data, with_s
     with_states.physics[:] = 3
     with pytest.raises(UserError, match="states in this dataset are equal"):
         made(with_states, tmp_path, "supervised")
+
+
+SIZE = 16
+
+
+def bright_square(folder: Path, episodes: int = 25, rows: int = 30) -> Path:
+    """A square that drifts over small pictures: two of the simulator's poses tell where, two velocities how fast."""
+    g = np.random.default_rng(0)
+    rows_of = fake_rows([rows] * episodes, physics_dim=18)
+    speed = g.uniform(-1.5, 1.5, (episodes, 1, 2))
+    place = g.uniform(4, SIZE - 4, (episodes, 1, 2)) + speed * np.arange(rows)[:, None]
+    low, span = 4, SIZE - 8
+    folded = np.abs((place - low) % (2 * span) - span)  # bounces between the walls
+    velocity = speed * -np.sign((place - low) % (2 * span) - span)
+    rows_of["physics"][:] = 0
+    rows_of["physics"][:, [0, 3]] = folded.reshape(-1, 2)
+    rows_of["physics"][:, [9, 10]] = velocity.reshape(-1, 2)
+    grid = np.arange(SIZE)
+    near = np.exp(-((grid - low - folded.reshape(-1, 2)[..., None]) ** 2) / 8)
+    picture = 40 + 200 * near[:, 0, :, None] * near[:, 1, None, :]
+    rows_of["observation"] = np.repeat(picture[:, None], 3, 1).astype(np.uint8)
+    folder.mkdir(parents=True)
+    write_shard(folder / "0_square.hdf5", rows_of, {})
+    return folder
+
+
+def test_a_trained_reference_knows_pose_and_velocity_that_an_untrained_one_does_not(tmp_path):
+    data, found = bright_square(tmp_path / "walker_walk" / "expert"), {}
+    dataset, hidden = open_dataset(data), {"corruption": "zero_frames", "zeroed_frames": 1}
+    settings = hidden | {"frame_encoder": "flat", "hidden_dim": 64, "shift": 0, "window": 16, "batch_size": 8}
+    for method, own in (("supervised", {"steps": 200, "learning_rate": 5e-3}), ("random", {"history": "gru"})):
+        run = run_pretrain(smoke_pretrain(data, tmp_path / method, method=method, **settings, **own))
+        frozen = FrozenEncoder(
+            load_encoder(run.path / "encoder")[0], dataset, CorruptionConfig.of(**hidden), 0, "fp32", 0
+        )
+        z = torch.cat([frozen.episode(i, frozen.view(0)) for i in range(dataset.num_episodes)])
+        found[method] = probe_state(z.numpy(), dataset.physics, dataset.episode.numpy(), LAYOUT)
+    losses = [row["loss"] for row in read_metrics(tmp_path / "supervised" / "metrics.jsonl")]
+    assert losses[-1] < 0.3 * losses[0]
+    for probe in ("probe_pose", "probe_velocity"):
+        assert found["supervised"][probe] < 0.6 * found["random"][probe]
