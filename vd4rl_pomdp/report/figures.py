@@ -82,7 +82,7 @@ def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, he
     figure.set_layout_engine("constrained")
     grid = figure.subplots(len(height), columns, squeeze=False, height_ratios=height)
     for axes, (title, rows, draw) in zip(grid.flat, panels, strict=False):
-        axes.set_title(plain(title, 96 // columns), fontsize=9)
+        axes.set_title(plain(title, 112 // columns), fontsize=9)
         axes.tick_params(labelsize=8)
         axes.locator_params(nbins=5)
         axes.grid(alpha=0.25)
