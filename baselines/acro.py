@@ -25,8 +25,8 @@ class ACROOptions(InverseOptions):
     """Options of `acro`."""
 
     shift_shared: bool = False
-    """Use one random shift for all observations of a window, as the other inverse models here do; the authors shift
-    each observation independently."""
+    """Use one random shift for all observations of a window, as the other inverse models here do.
+    The authors shift each observation independently."""
 
 
 class ACRO(StateInverse):

@@ -23,8 +23,8 @@ class FinetuneConfig(StageConfig):
     """Train a policy on a frozen encoder. Some flags depend on --algorithm: put it before --help."""
 
     encoder: Path = Path()
-    """Encoder folder, `RUN/encoder` of a pretraining run. The encoder stays frozen, except with bc and drq_bc, which
-    train it end to end. Training and evaluation use its corruption."""
+    """Encoder folder, `RUN/encoder` of a pretraining run. Training and evaluation use its corruption.
+    The encoder stays frozen, except with bc and drq_bc, which train it end to end."""
     data: Path = Path()
     """Dataset folder."""
     out: Path = Path()
@@ -32,8 +32,8 @@ class FinetuneConfig(StageConfig):
     algorithm: str = "td3_bc"
     """Algorithm; `vd4rl-pomdp list` shows all of them. Encoders of bc and drq_bc use their own algorithm instead."""
     seed: int = 0
-    """Seed of the networks, batches and noise, and of the views unless --view-seed is given. --seeds 0,1,2 instead
-    trains several runs in one process, in OUT/seed0, OUT/seed1, ..."""
+    """Seed of the networks, batches and noise, and of the views unless --view-seed is given.
+    Instead, --seeds 0,1,2 trains several runs in one process, in OUT/seed0, OUT/seed1, ..."""
     updates: int = 500_000
     """Gradient updates."""
     batch_size: int = 256
@@ -43,19 +43,18 @@ class FinetuneConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     views: int = 4
-    """Number of times the dataset is encoded up front, each with its own draw of corruption and random shift; 0 encodes
-    every batch on the fly."""
+    """Number of times the dataset is encoded up front, each with its own draw of corruption and random shift.
+    If 0, every batch is encoded on the fly."""
     view_seed: int | None = None
-    """Seed of the views: their corruption, shifts and random histories. Runs with the same view seed train on the same
-    features; None: use --seed."""
+    """Seed of the views: their corruption, shifts and random histories. None: use --seed.
+    Runs with the same view seed train on the same features."""
     shift: int = 4
-    """Maximum random shift in pixels. Drawn once per episode and view; per transition with --views 0; per observation
-    when the encoder is trained."""
+    """Maximum random shift in pixels, drawn once per episode and view.
+    With --views 0 it is drawn per transition; when the encoder is trained, per observation."""
     precision: Precision = "fp32"
     """Encoder precision: fp32, tf32 (GPU only) or bf16 autocast."""
     update_precision: Precision = "fp32"
-    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast, which keeps the last
-    layers in fp32."""
+    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast but for the last layers."""
     eval_every: int = 50_000
     """Updates between evaluations; the final update is always evaluated."""
     eval_episodes: int = 10
@@ -65,8 +64,8 @@ class FinetuneConfig(StageConfig):
     eval_clean_episodes: int = 0
     """Episodes of the uncorrupted final evaluation; 0: same as --eval-episodes."""
     eval_length: int = 500
-    """Maximum decisions per evaluation episode, capped at the task's episode length. Lower it only for quick tests. The
-    default always means full episodes, even for tasks with more than 500 decisions."""
+    """Maximum decisions per evaluation episode, at most the task's own. Lower it only for quick tests.
+    The default always means full episodes, even for tasks with more than 500 decisions."""
     workers: int = 0
     """Evaluation processes; 0: one per core."""
     device: str = "auto"

@@ -52,8 +52,8 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (much cheaper), nature_half (nature at half resolution), small, mixer or pretrained (a
-    frozen image model); state reads the simulator state instead of pixels."""
+    """Frame encoder: drq, nature (much cheaper), nature_half (nature at half resolution), small, mixer,
+    pretrained (a frozen image model), or state, which reads the simulator state instead of pixels."""
     precision: Precision = "fp32"
     """Precision of matrix products: fp32, tf32 (on a GPU), or bf16 autocast."""
     device: str = "auto"

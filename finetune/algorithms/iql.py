@@ -48,8 +48,7 @@ class IQLOptions(ReturnOptions):
     """Options of IQL."""
 
     expectile: float = 0.7
-    """IQL's expectile, from 0 to 1: at 0.5 V is the mean over actions; larger values move it towards the best
-    actions."""
+    """IQL's expectile, from 0 to 1: at 0.5 V is the mean over actions; larger values favour the best actions."""
     temperature: float = 3.0
     """IQL's inverse temperature beta: actions are cloned with weight exp(beta * advantage)."""
 

@@ -25,8 +25,8 @@ class StateOptions(Options):
     """Options of the `state` reference."""
 
     pose_noise: float = 0.0
-    """Gaussian noise on poses: its mean absolute value, in percent of each coordinate's standard deviation (the unit of
-    probe errors)."""
+    """Gaussian noise on poses: its mean absolute value, in percent of each coordinate's standard deviation.
+    This is the unit of probe errors."""
     velocity_noise: float = 0.0
     """The same for velocities."""
 

@@ -39,8 +39,7 @@ def download(
 
     Args:
         task: One or more of walker_walk, cheetah_run, humanoid_walk.
-        quality: One or more of random, medium_replay, medium, medium_expert, expert; each is downloaded for every
-            task.
+        quality: One or more of random, medium_replay, medium, medium_expert, expert, for every task.
         out: Folder for datasets: OUT/TASK/QUALITY/84px.
         endpoint: Address of a mirror; default: HF_ENDPOINT, else https://huggingface.co.
         verify: Also check the SHA-256 of files that exist already.

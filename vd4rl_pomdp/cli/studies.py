@@ -148,10 +148,10 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
 
     Args:
         json: Print one JSON object instead of a table.
-        quick: A tenth of the frames and fewer repetitions: rougher numbers; fixed costs dominate the peak memory. With
-            --gpu only a test of the code.
-        gpu: Benchmark the paper preset on one GPU instead: CUDA graphs, stacked seeds, the same update in JAX,
-            encoding, an evaluation; under three minutes.
+        quick: A tenth of the frames and fewer repetitions: rougher numbers; fixed costs dominate the peak memory.
+            With --gpu only a test of the code.
+        gpu: Benchmark the paper preset on one GPU instead: CUDA graphs, stacked seeds, JAX, encoding, evaluation.
+            It takes under three minutes.
         device: Training device: auto, cpu or cuda. With --gpu and --quick, cpu tests the code without a GPU.
     """
     from vd4rl_pomdp.bench import gpu as on_gpu

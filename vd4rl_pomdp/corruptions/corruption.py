@@ -211,7 +211,7 @@ class CorruptionConfig(Options):
     corruption: str = "none"
     """none, or stages joined by +: patch, zero_frames, truncate, patch+zero_frames, ..."""
     corruption_mode: Mode = "resample"
-    """resample: a row gets a new mask whenever it is sampled, as in the paper (with cached features: once per view);
+    """resample: a row gets a new mask whenever it is sampled, as in the paper (with cached features: once per view).
     emission: a row always gets the same mask, in all runs with the same seed."""
     stages: tuple[Options, ...] = ()
     """The stages, one per part of the name."""

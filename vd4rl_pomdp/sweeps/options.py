@@ -27,8 +27,8 @@ class LocalOptions(Options):
     threads: int = 0
     """CPU threads per job; 0: its share of the machine's cores."""
     stack: int = 1
-    """Maximum fine-tunings trained together in one process, in the slot of one job. Results match single runs up to
-    rounding."""
+    """Maximum fine-tunings trained together in one process, in the slot of one job.
+    Results match single runs up to rounding."""
 
     limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64), "threads": (0, 4096), "stack": (1, 64)}
 
