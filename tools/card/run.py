@@ -213,7 +213,8 @@ def main() -> None:
     done = args.home and (args.home / "results").is_dir()
     if args.home and (parts := sorted(args.home.glob("encoders.tar.*"))):  # to where the sweep finds them
         with tarfile.open(fileobj=io.BytesIO(b"".join(part.read_bytes() for part in parts))) as file:
-            file.extractall(args.work / "runs", filter="data")
+            checked = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from Python 3.11.4 on
+            file.extractall(args.work / "runs", **checked)
     if done and args.home.resolve() != args.out.resolve():
         shutil.copytree(args.home / "results", args.out / "results", dirs_exist_ok=True)
     session.describe()
