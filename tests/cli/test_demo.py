@@ -77,7 +77,7 @@ def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_pat
     told = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
     assert Counter(told) == {"data": 1, "pretrain": 3, "finetune": 3, "navigation": 3, "report": 1}
     out = [" ".join(line.split()) for line in shown.out.splitlines()]
-    start = next(number for number, line in enumerate(out) if line.startswith(f"Under {LABELS['corruption']}, what"))
+    start = next(number for number, line in enumerate(out) if line.startswith(f"Under {LABELS['corruption']}, errors"))
     lines = [f"{method} 39, 54 120 ± 20 (n = 2)" for method in METHODS]
     assert out[start + 3 : start + 6] == lines, "of the last evaluation, and how sure it is"
     assert out[start + 6].startswith("One seed each")

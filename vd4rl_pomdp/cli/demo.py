@@ -91,9 +91,9 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
     """Summary lines: probe errors and returns of the demo's methods, with standard errors."""
     policies = [(job.settings, job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
-    yield f"Under {corruption}, what is not known of pose and velocity (error of a"
-    yield "linear probe in % of a standard deviation; 60 to 80 knows nothing), and the"
-    yield "return (mean ± standard error over episodes):"
+    yield f"Under {corruption}, errors of linear probes for pose and velocity (in % of a"
+    yield "standard deviation; 60 to 80 for an encoder that knows nothing), and returns"
+    yield "(mean ± standard error over episodes):"
     for settings, folder in policies:
         rows = read_episodes(folder / EPISODES_FILE)
         last = max(row["step"] for row in rows)
@@ -101,8 +101,8 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
         probe = read_json(folder / PROBE_FILE)
         known = ", ".join(f"{probe[name]:.0f}" for name in PROBES)
         yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
-    yield "One seed each: with another, what is known hardly changes, and returns may end"
-    yield "elsewhere. What three seeds say of 100 episodes is in results/control."
+    yield "One seed each: between seeds probe errors hardly vary, but returns do."
+    yield "Three seeds on 100 episodes: results/control."
 
 
 def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
@@ -114,4 +114,4 @@ def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
     for run in runs:
         error = run.values.get(refitted_error("position", rows="hidden"))
         yield f"  {run.condition.method:<12}{'no hidden step' if error is None else f'{error:.0f}'}"
-    yield f"The mass, and where each takes it to be: {film}"
+    yield f"Film of the mass and of each method's estimate: {film}"
