@@ -6,7 +6,7 @@ Interface for the rest of the package:
     tables                      group-bys of the frames: evaluations, summary, aggregate, improvement, ...
     gates                       conditions for ranking methods, and the paper's claims with verdicts
     stats                       means, differences, intervals; `number`, `with_interval`, `mean_and_error` format them
-    load.Choice, without_options    what a report covers, such as a grid's cells
+    load.Choice                 what a report covers, such as a grid's cells
     page.write_report           writes a report's folder; `figures` makes its figures
 """
 

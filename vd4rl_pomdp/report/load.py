@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import LABELS, LATER, settings_of
+from vd4rl_pomdp.core.options import LATER, settings_of
 from vd4rl_pomdp.core.reading import damaged
 from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.data.reference import Reference, summarise
@@ -81,21 +81,18 @@ class Choice:
     def among(self, results: list[Result]) -> list[Result]:
         return results
 
-    def asks(self, row: Row) -> bool:
-        """Whether a run with these labels is reported as missing if it does not exist."""
-        return True
-
-    @property
-    def wanted(self) -> Sequence[Row]:
-        return ()
+    wanted: Sequence[Row] = ()
+    """The policies that are reported as missing if they do not exist, where known: LABELS, the `variant` by which to
+    name one if none of its seeds was run, and the hash of its `experiment`."""
 
 
 ALL = Choice()
 
 
-def without_options(row: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
-    """Some labels of a run or gap, with the corruption's options cut off ("patch, patch_size 48" -> "patch")."""
-    return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in names)
+def unusual(settings: Mapping[str, Any]) -> str:
+    """The settings that are part of a method's name, unless they have their usual values: "history gru"."""
+    words = {name: _words(settings[name]) for name in PLAIN if name in settings}
+    return ", ".join(f"{name} {value}" for name, value in words.items() if value != PLAIN[name])
 
 
 @dataclass(frozen=True)
@@ -404,32 +401,56 @@ def runs_frame(runs: Iterable[Run]) -> pd.DataFrame:
 def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
     """One row per missing or unfinished run: CONDITION, seed and `state`.
 
-    In each setting, every method of the report is expected with all its variants, for every seed that any run has in
-    that setting; also whatever the choice asks for there.
+    In the settings of the report, the policies that the choice wants. If it names none: every method of the report with
+    all its variants, for every seed that any run has in that setting.
     """
-    grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
+    policies = sorted(
+        (run for run in runs if run.stage == "finetune" and run.labels["task"]), key=attrgetter("evaluated")
+    )
+    return _wanted(policies, choice.wanted) if choice.wanted else _inferred(policies)
+
+
+def _wanted(policies: list[Run], wanted: Iterable[Row]) -> list[Row]:
+    settings = {_without_options(run.labels): run.of(SETTING) for run in policies}
+    made = {(_without_options(run.labels), run.result.experiment, run.labels["seed"]): run for run in policies}
+    others = {(place, experiment): run for (place, experiment, _), run in made.items()}
     rows = []
-    for place, here in groups(grid, lambda run: run.of(SETTING)).items():
-        there = {run.of((*CONDITION, "seed")): run for run in sorted(here, key=attrgetter("evaluated"))}
+    for row in wanted:
+        place, experiment = _without_options(row), row["experiment"]
+        run = made.get((place, experiment, row["seed"]))
+        if place in settings and not (run and run.evaluated):
+            other = others.get((place, experiment))  # another seed of it
+            named = other.named if other else row | dict(zip(SETTING, settings[place], strict=True))
+            rows.append({name: named[name] for name in CONDITION} | {"seed": row["seed"], "state": _state(run)})
+    return rows
+
+
+def _without_options(row: Row) -> tuple[Any, ...]:
+    """The setting of a run or gap, with the corruption's options cut off ("patch, patch_size 48" -> "patch")."""
+    return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in SETTING)
+
+
+def _state(run: Run | None) -> str:
+    """Why a run has no results: "missing"."""
+    if run is None:
+        return MISSING
+    return "not evaluated" if run.finished else run.progress
+
+
+def _inferred(policies: list[Run]) -> list[Row]:
+    rows = []
+    for place, here in groups(policies, lambda run: run.of(SETTING)).items():
+        there = {run.of((*CONDITION, "seed")): run for run in here}
         seeds = sorted({run.labels["seed"] for run in here})
-        for method, mine in groups(grid, lambda run: run.of(("algorithm", "method"))).items():
+        for method, mine in groups(policies, lambda run: run.of(("algorithm", "method"))).items():
             for variant in _expected(mine, place):
                 # A variant with a shared encoder needs no run for the seed that trained the encoder.
                 own = {seed for seed in seeds if f"{ENCODER_SEED} {seed}" in variant.split(", ")}
                 for seed in (seed for seed in seeds if seed not in own):
                     run = there.get((*place, *method, variant, seed))
                     if run is None or not run.evaluated:
-                        state = MISSING if run is None else "not evaluated" if run.finished else run.progress
-                        values = (*place, *method, variant)
-                        rows.append(dict(zip(CONDITION, values, strict=True)) | {"seed": seed, "state": state})
-    rows = [row for row in rows if choice.asks(row)]
-    known = {without_options(row, LABELS) for row in (*(run.labels for run in grid), *rows)}
-    settings = {without_options(run.labels, SETTING): run.labels["corruption"] for run in grid}
-    for row in choice.wanted:  # never started, in settings that some run has
-        if without_options(row, LABELS) not in known and without_options(row, SETTING) in settings:
-            named = {name: row.get(name, "") for name in CONDITION}
-            named["corruption"] = settings[without_options(row, SETTING)]
-            rows.append(named | {"seed": row["seed"], "state": MISSING})
+                        named = dict(zip(CONDITION, (*place, *method, variant), strict=True))
+                        rows.append(named | {"seed": seed, "state": _state(run)})
     return rows
 
 

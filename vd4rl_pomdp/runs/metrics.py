@@ -213,8 +213,7 @@ class Wandb:
 def wandb_names(run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
     """wandb's `name`, `tags` and `group` of a run; seeds of one experiment share the group."""
     told = [str(value) for name, value in labels.items() if name != "seed" and value != ""]
-    record = {"stage": run.stage, "config": run.config | {"seed": None}}
-    mark = recipe(record, {**card, "seed": None} if card else {})[:6]
+    mark = recipe({"stage": run.stage, "config": run.config}, card, seeds=False)[:6]
     title = " ".join([run.stage, *told])
     group = f"{title[: LONGEST['group'] - 7]} {mark}"
     seed = f" seed {run.config['seed']}"

@@ -122,7 +122,16 @@ class Result:
     @cached_property
     def recipe(self) -> str:
         """Hash of what it computes, ignoring its data's content."""
-        return recipe(self.record, self.card if {"settings", "seed"} <= self.card.keys() else {})
+        return recipe(self.record, self._settings_card)
+
+    @cached_property
+    def experiment(self) -> str:
+        """The same for all of its seeds."""
+        return recipe(self.record, self._settings_card, seeds=False)
+
+    @property
+    def _settings_card(self) -> dict[str, Any]:
+        return self.card if {"settings", "seed"} <= self.card.keys() else {}
 
     @property
     def on_one_set(self) -> bool:

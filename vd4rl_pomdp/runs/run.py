@@ -47,10 +47,10 @@ def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
     return content_hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
 
 
-def recipe(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
-    """Like `identity`, without the data's content."""
-    own = settings_of(record["config"]) | {"seed": record["config"]["seed"]}
-    before = {"settings": card["settings"], "seed": card["seed"]} if card else {}
+def recipe(record: Mapping[str, Any], card: Mapping[str, Any], seeds: bool = True) -> str:
+    """Like `identity`, without the data's content; without `seeds`, one hash for all seeds of an experiment."""
+    own = settings_of(record["config"]) | {"seed": record["config"]["seed"] if seeds else None}
+    before = {"settings": card["settings"], "seed": card["seed"] if seeds else None} if card else {}
     return content_hash([record.get("format", 1), record["stage"], own, before])
 
 

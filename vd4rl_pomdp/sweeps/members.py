@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.data.collect import set_quality
-from vd4rl_pomdp.report.load import Choice, without_options
+from vd4rl_pomdp.report.load import Choice, unusual
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.results import Result
 from vd4rl_pomdp.sweeps.grid import GridCell
@@ -24,7 +23,7 @@ class GridMembers(Choice):
         """Work out what some cells of the grid `name` compute; UserError if one is invalid, or trains in a maze."""
         self._what = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
-        self._policies: set[tuple[Any, ...]] = set()  # values of LABELS of the policies that the cells train
+        self.wanted: list[Row] = []
         check_cells(cells, name)
         for cell in cells:
             if "navigation_train" in cell.chain:
@@ -33,9 +32,12 @@ class GridMembers(Choice):
             for section in cell.chain[1:]:
                 self._sets[recipe_of(cell, section)].append(data)
             if "finetune" in cell.chain:
-                before, algorithm = recorded(cell, "pretrain"), recorded(cell, "finetune")["algorithm"]
-                named = data.wanted["task"], set_quality(config_of(cell, data.section)), before["corruption"]
-                self._policies.add((before["method"], *named, algorithm, cell.seed))
+                settings = recorded(cell, "pretrain") | recorded(cell, "finetune")
+                quality = set_quality(config_of(cell, data.section))
+                labels = settings | {"task": data.wanted["task"], "quality": quality, "seed": cell.seed}
+                experiment = recipe_of(cell, "finetune", seeds=False)
+                named = {"variant": unusual(settings), "experiment": experiment}
+                self.wanted.append({name: labels[name] for name in LABELS} | named)
 
     def among(self, results: list[Result]) -> list[Result]:
         """The runs that belong to the grid, in order; UserError if none does."""
@@ -43,14 +45,6 @@ class GridMembers(Choice):
         if not found:
             raise UserError(f"none of {len(results)} runs is {self._what}; `sweep run --dry-run` lists the cells")
         return found
-
-    def asks(self, row: Row) -> bool:
-        """Whether some cell asks for a policy with these labels (`options.LABELS`), ignoring variants."""
-        return without_options(row, LABELS) in self._policies
-
-    @property
-    def wanted(self) -> list[Row]:
-        return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
     def _has(self, run: Result) -> bool:
         """Whether some cell asks for this run. Without collection settings (imported data), task and quality decide."""

@@ -97,13 +97,13 @@ def collection_of(cell: GridCell) -> Values:
     return collection(config) if isinstance(config, CollectConfig) else maze_collection(config)
 
 
-def recipe_of(cell: GridCell, section: str) -> str:
+def recipe_of(cell: GridCell, section: str, seeds: bool = True) -> str:
     """Hash of what a cell's training computes, apart from its data's content. Equals the one in the run's records."""
     record = {"format": FORMAT, "stage": STAGES[section], "config": recorded(cell, section)}
     if section != "finetune":
-        return recipe(record, {})
+        return recipe(record, {}, seeds)
     before = recorded(cell, "pretrain")
-    return recipe(record, {"settings": settings_of(before), "seed": before["seed"]})
+    return recipe(record, {"settings": settings_of(before), "seed": before["seed"]}, seeds)
 
 
 def recorded(cell: GridCell, section: str) -> Values:
