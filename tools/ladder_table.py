@@ -195,8 +195,8 @@ def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
         ]
         rows.append(row)
     head = ["set (data's return)", "policy", "best rung: return (updates)", "last rung: return (updates)"]
-    head += ["the same, played clean", "critic converged at (updates)", "its value at the end; the data's own"]
-    head += ["held-out cloning loss: lowest (updates), last", "last on episodes of the set, on batches"]
+    head += ["the same, evaluated clean", "critic converged at (updates)", "its final value; the data's own"]
+    head += ["held-out cloning loss: lowest (updates), last", "last on dataset episodes, on batches"]
     return table_lines(head, rows, (0, 1))
 
 
@@ -233,7 +233,7 @@ def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
             for rung, one in cell.returns.items():  # with the standard error over the episodes' common starts
                 text = mean_and_error([value - one[seed] for seed, value in other.returns[rung].items()])
                 line[rung] = text if text.startswith("-") else f"+{text}"
-            rows.append((cell.key.setting, f"`mik+a` less {cell.key.called}", "return", line))
+            rows.append((cell.key.setting, f"`mik+a` minus {cell.key.called}", "return", line))
     table = ((*words, *(line.get(rung, "") for rung in rungs)) for *words, line in rows)
     return table_lines(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), table, (0, 1, 2))
 
@@ -249,7 +249,7 @@ def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
         hidden = {key: ", nothing hidden" * (key.corruption == "none") for key in keys if key not in there}
         missing = "; ".join(f"{key.quality}, `{key.method}`{words}" for key, words in hidden.items())
         updates += " so far" * bool(mine and missing)
-        rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", updates, missing or "all are there"))
+        rows.append((task, f"{units:,}", f"{len(mine)} of {len(keys)}", updates, missing or "none"))
     head = ("task", "units", "cells that count, of those required", "updates by the rule", "not run yet")
     return table_lines(head, rows, (0, 4))
 
@@ -294,7 +294,7 @@ def _draw_losses(axes: Axes, cell: Cell, look: dict[str, Any]) -> None:
         faint = {"alpha": alpha, "marker": None} if alpha else {}
         axes.plot(np.array(sorted(losses)) / 1000, [losses[rung] for rung in sorted(losses)], **(look | faint))
     if not axes.texts:
-        key = "dots: held-out episodes\nfainter: episodes of the set\nfaintest: batches of training"
+        key = "dots: held-out episodes\nfainter: dataset episodes\nfaintest: training batches"
         axes.text(0.03, 0.05, key, transform=axes.transAxes, fontsize="small", color="0.3")
 
 

@@ -24,7 +24,7 @@ from vd4rl_pomdp.sweeps.members import GridMembers
 RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
 HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
-ALONE = ", patches alone"
+ALONE = ", patches only"
 """Suffix of a dataset's name for patches without zeroed frames."""
 UNTRAINED = "random"
 SETS = {
@@ -42,16 +42,16 @@ MAIN = (UNTRAINED, "acro", "mik", "mik+a")
 EXPLORATORY = ("expert_noisy", "medium_noisy")
 """Qualities chosen after looking at first returns."""
 CONTRASTS = {
-    "a memory: `mik` less `acro`": ("mik", "acro"),
-    "past actions: `mik+a` less `mik`": ("mik+a", "mik"),
-    "both: `mik+a` less `acro`": ("mik+a", "acro"),
+    "a memory: `mik` minus `acro`": ("mik", "acro"),
+    "past actions: `mik+a` minus `mik`": ("mik+a", "mik"),
+    "both: `mik+a` minus `acro`": ("mik+a", "acro"),
 }
 """The paper's claims, as differences of returns."""
 CORRUPTIONS = {"patch+zero_frames": "patches and frames", "none": "nothing"}
 """Names of corruptions in the table of methods, in column order."""
 ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
 """Clean evaluations of policies, made after their runs had ended."""
-GOING_WITH = {
+ERRORS = {
     **dict(zip(PROBES, ("probe of the pose", "probe of the velocity"), strict=True)),
     **dict(zip(load.ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
 }
@@ -97,10 +97,10 @@ def return_lines(runs: Sequence[Run]) -> Iterator[str]:
     rows = []
     for place, corruption, here in _measured_sets(runs):
         cells = [_mean_text(_of(here, method, corruption)) for method in MAIN]
-        cells += [_less(here, corruption, "mik+a", "acro", clean) for clean in (False, True)]
+        cells += [_difference(here, corruption, "mik+a", "acro", clean) for clean in (False, True)]
         name = f"{SETS[place]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
         rows.append((name + ", exploratory" * (place[1] in EXPLORATORY), *cells, _mean_text(_of(here, "acro", CLEAN))))
-    head = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
+    head = (*(f"`{name}`" for name in MAIN), "`mik+a` minus `acro`", "the same, evaluated clean")
     return table_lines(("set (data's return)", *head, "`acro` trained with nothing hidden"), rows)
 
 
@@ -112,13 +112,13 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
         methods = {run.method for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
         known = {method: seeds for method in methods if len(seeds := _of(here, method, corruption)) > 1}
         other = max(known, key=lambda method: returns_of(known[method]).mean())
-        for clean, words in ((False, "as trained"), (True, "with nothing hidden")):
+        for clean, words in ((False, "as trained"), (True, "clean")):
             pairs = (*CONTRASTS.values(), ("mik+a", other))
-            cells = [_less(here, corruption, *pair, clean) for pair in pairs]
+            cells = [_difference(here, corruption, *pair, clean) for pair in pairs]
             if any(cell != number(None) for cell in cells):
                 cells[-1] += f" (`{other}`)" * (cells[-1] != number(None))
                 rows.append((_name(*place, corruption), words, *cells))
-    return table_lines(("set", "played", *CONTRASTS, "`mik+a` less the best other"), rows, (0, 1))
+    return table_lines(("set", "evaluated", *CONTRASTS, "`mik+a` minus the best other"), rows, (0, 1))
 
 
 def _mean_text(runs: list[Run]) -> str:
@@ -130,7 +130,7 @@ def _mean_text(runs: list[Run]) -> str:
     return text + (f" (n = {len(runs)})" if len(runs) < 3 else "")
 
 
-def _less(runs: Sequence[Run], corruption: str, method: str, other: str, clean: bool) -> str:
+def _difference(runs: Sequence[Run], corruption: str, method: str, other: str, clean: bool) -> str:
     """Difference of two methods' mean returns with its interval; a dash if either was not evaluated so."""
     one, two = (_episodes(_of(runs, name, corruption), clean) for name in (method, other))
     if one is None or two is None:
@@ -169,7 +169,7 @@ def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
             chance = above.loc[row["method"], ["probability", "low", "high"]] if known else [None] * 3
             rows.append((f"{row['tasks']} {kind}", f"`{row['method']}`", *cells, with_interval(*chance, 2)))
     return table_lines(
-        ("sets", "method", "interquartile mean", "mean", "chance that `mik+a` ends above it"), rows, (0, 1)
+        ("sets", "method", "interquartile mean", "mean", "probability that `mik+a` is better"), rows, (0, 1)
     )
 
 
@@ -182,8 +182,8 @@ def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
         shares += [f"{number(row['acro_bar'], 2)} ({row['bar_from']})", number(row["best_share"], 2)]
         above = with_interval(row["above_random"], row["low"], row["high"], 0)
         rows.append((row["name"], f"{row['data_return']:.0f}", *shares, above, row["passed"]))
-    shares = ("`state` / data", "`acro` with nothing hidden / data", "its bar (published score)", "best / data")
-    return table_lines(("set", "data's return", *shares, "best less `random`", "passed"), rows, (0, 7))
+    shares = ("`state` / data", "`acro` with nothing hidden / data", "its threshold (published score)", "best / data")
+    return table_lines(("set", "data's return", *shares, "best minus `random`", "passed"), rows, (0, 7))
 
 
 def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -194,9 +194,9 @@ def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
         places = ["task", "quality", "corruption"]
         probed = frame[(frame[places] == [row[name] for name in places]).all(axis=1)]
         trained = probed[probed["method"] != UNTRAINED]
-        cells = (f"{_rank_correlation(probed, name)}, {_rank_correlation(trained, name)}" for name in GOING_WITH)
+        cells = (f"{_rank_correlation(probed, name)}, {_rank_correlation(trained, name)}" for name in ERRORS)
         rows.append((row["name"], row["passed"], f"{len(probed)}, {len(trained)}", *cells))
-    return table_lines(("set", "passed", "runs", *GOING_WITH.values()), rows, (0, 1))
+    return table_lines(("set", "passed", "runs", *ERRORS.values()), rows, (0, 1))
 
 
 def _judged(runs: Sequence[Run]) -> Iterator[Row]:
