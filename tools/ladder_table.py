@@ -215,27 +215,20 @@ def _spans(cell: Cell) -> str:
 
 
 def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """Return, critic value and cloning loss of each run by rung, and the difference of `mik+a` and `acro`."""
+    """Return of each run by rung, and the difference of `mik+a` and `acro`."""
     rungs, rows = sorted({rung for cell in cells for rung in cell.returns}), []
     by_key = {cell.key: cell for cell in cells}
     for cell in cells:
-        by_rung = {rung: (mean_and_error(_of(cell, rung)), drift(cell.q, rung)) for rung in cell.returns}
-        three = cell.held_out, cell.trained_on, cell.batches
-        lines = {
-            "return": {rung: text for rung, (text, _) in by_rung.items()},
-            "critic": {rung: f"{cell.q[rung]:.0f} ({moved:+.1%})" for rung, (_, moved) in by_rung.items()},
-            "cloning": {rung: "; ".join(f"{loss[rung]:.3f}" for loss in three) for rung in by_rung},
-        }
-        rows += [(cell.key.setting, cell.key.called, what, line) for what, line in lines.items()]
+        rows.append((cell, cell.key.called, {rung: mean_and_error(_of(cell, rung)) for rung in cell.returns}))
         other = by_key.get(cell.key._replace(method="mik+a"))
         if cell.key.method == "acro" and other:
             line = {}
             for rung, one in cell.returns.items():  # with the standard error over the episodes' common starts
                 text = mean_and_error([value - one[seed] for seed, value in other.returns[rung].items()])
                 line[rung] = text if text.startswith("-") else f"+{text}"
-            rows.append((cell.key.setting, f"`mik+a` minus {cell.key.called}", "return", line))
-    table = ((*words, *(line.get(rung, "") for rung in rungs)) for *words, line in rows)
-    return table_lines(("set", "policy", "", *(f"{rung:,}" for rung in rungs)), table, (0, 1, 2))
+            rows.append((cell, f"`mik+a` minus {cell.key.called}", line))
+    table = ((cell.key.setting, called, *(line.get(rung, "") for rung in rungs)) for cell, called, line in rows)
+    return table_lines(("set", "return of", *(f"{rung:,}" for rung in rungs)), table, (0, 1))
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:
