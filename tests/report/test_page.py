@@ -21,6 +21,7 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report import figures, films, print_summary, write_report
+from vd4rl_pomdp.report.load import CONDITION
 from vd4rl_pomdp.report.render import write_latex
 from vd4rl_pomdp.runs.episodes import drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -300,6 +301,13 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
     left = {path.name for path in folder.iterdir()} - {file.name for file in mine}
     assert left == found, "figures of an earlier report go, nobody else's"
     assert all(file.exists() for file in mine)
+
+
+def test_single_evaluations_make_no_learning_curve(tmp_path):
+    curves = pd.DataFrame(
+        [dict.fromkeys(CONDITION, "") | {"step": 10, "score": 1.0, "low": 1.0, "high": 1.0, "seeds": 2}]
+    )
+    assert figures.curve_plots(curves, {}) == []
 
 
 def test_figures_show_returns_below_zero_best_evaluations_and_gaps(tmp_path, monkeypatch, drawn):

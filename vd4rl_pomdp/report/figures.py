@@ -247,7 +247,8 @@ def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str
 
 
 def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Score over updates: one figure per corruption, one line per method."""
+    """Score over updates: one figure per corruption, one line per method; none where all were evaluated once."""
+    curves = curves[curves.groupby(list(SETTING))["step"].transform("nunique") > 1]
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "step", "score")
