@@ -9,7 +9,7 @@ import pytest
 from tests.helpers_data import fake_rows
 from tests.helpers_report import describe, without_figures, write_run
 from tests.helpers_stages import contents
-from vd4rl_pomdp.cli import main, sweeps
+from vd4rl_pomdp.cli import main, studies
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, NEEDS_NOT, OPEN, judge
@@ -38,7 +38,7 @@ def carried(monkeypatch):
             done.append(job.words)
             main(job.words)
 
-    monkeypatch.setattr(sweeps, "carry_out", carry_out)
+    monkeypatch.setattr(studies, "carry_out", carry_out)
     return done
 
 

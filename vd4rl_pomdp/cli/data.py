@@ -8,9 +8,13 @@ from pathlib import Path
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, show
+from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.parsing import parse, parse_stage
+from vd4rl_pomdp.data import collect as collection
+from vd4rl_pomdp.data import download as published
+from vd4rl_pomdp.data import transfer
+from vd4rl_pomdp.data.card import write_card
+from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.sweeps.options import program_name
 
 REPLAY_TOLERANCE = 1e-6
@@ -19,10 +23,8 @@ REPLAY_TOLERANCE = 1e-6
 
 def collect(words: list[str], program: str) -> None:
     """Collect a dataset."""
-    from vd4rl_pomdp.data.collect import CollectConfig, collect
-
-    config = parse(CollectConfig, words, program)
-    shards = collect(config)
+    config = parse(collection.CollectConfig, words, program)
+    shards = collection.collect(config)
     print(f"shards in {config.out}: {len(shards)}, described in {config.out / 'card.md'}")
     print(f"check them with `{program_name()} data check {shlex.quote(str(config.out))}`")
 
@@ -44,11 +46,9 @@ def download(
         endpoint: Address of a mirror; default: HF_ENDPOINT, else https://huggingface.co.
         verify: Also check the SHA-256 of files that exist already.
     """
-    from vd4rl_pomdp.data.download import check_published, download
-
-    check_published(task, quality)  # reject unknown names before the first download, which takes hours
+    published.check_published(task, quality)  # reject unknown names before the first download, which takes hours
     for one, level in itertools.product(task, quality):
-        shards = download(one, level, out, endpoint, verify)
+        shards = published.download(one, level, out, endpoint, verify)
         folder = shards[0].parent
         check = f"{program_name()} data check {shlex.quote(str(folder))}"
         print(f"shards in {folder}: {len(shards)}; check them with `{check}`")
@@ -77,9 +77,7 @@ def import_set(
         picture: Observation key of the images, if there are several.
         clip_actions: Clip actions outside the source's bounds instead of rejecting them.
     """
-    from vd4rl_pomdp.data.transfer import import_set
-
-    shards = import_set(format, source, out, task, quality, size, picture, clip_actions)
+    shards = transfer.import_set(format, source, out, task, quality, size, picture, clip_actions)
     print(f"shards in {out}: {len(shards)}, described in {out / 'card.md'}")
 
 
@@ -98,9 +96,7 @@ def export_set(
         out: Output folder.
         size: Height and width to resize frames to, by area; default: no resizing.
     """
-    from vd4rl_pomdp.data.transfer import export_set
-
-    export_set(format, set, out, size)
+    transfer.export_set(format, set, out, size)
     print(f"exported to {out}")
 
 
@@ -111,14 +107,12 @@ def card(set: tyro.conf.Positional[Path]) -> None:
     Args:
         set: Dataset folder.
     """
-    from vd4rl_pomdp.data.card import write_card
-
     print(f"card: {write_card(set)}")
 
 
 def view(words: list[str], program: str) -> None:
     """Write an HTML page to browse episodes."""
-    from vd4rl_pomdp.report.browse import ViewConfig, write_view
+    from vd4rl_pomdp.report.browse import ViewConfig, write_view  # loads what draws figures
 
     print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
 
@@ -131,8 +125,6 @@ def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
         set: Dataset folder.
         json: Print one JSON object.
     """
-    from vd4rl_pomdp.data.check import check_dataset
-
     result = check_dataset(set)
     show(result, json)
     error = result["replay_max_error"]
@@ -151,7 +143,7 @@ def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) ->
         set: A dataset, whose background decides; without one, the reference frames do.
         json: Print one JSON object.
     """
-    from vd4rl_pomdp.data.parity import check_parity
+    from vd4rl_pomdp.data.parity import check_parity  # loads OpenGL
 
     result = check_parity(set)
     show(result, json)

@@ -58,7 +58,7 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
         episodes: Episodes played by the exported agent for its card, with and without its corruption.
         workers: Worker processes; 0 uses every core.
     """
-    from finetune.export import export_agent
+    from finetune.export import export_agent  # loads OpenGL
 
     card = export_agent(run, out, episodes, workers)
     for under in dict.fromkeys(row["evaluated_under"] for row in card["episodes"]):
@@ -79,8 +79,8 @@ def play(
         film: File to write (animated WebP): each agent's first episode as it sees it.
         workers: Worker processes; 0 uses every core.
     """
-    from finetune.export import play_agents
-    from vd4rl_pomdp.report.films import side_by_side
+    from finetune.export import play_agents  # loads OpenGL
+    from vd4rl_pomdp.report.films import side_by_side  # loads what draws figures
     from vd4rl_pomdp.report.stats import mean_interval, with_interval
 
     if film:

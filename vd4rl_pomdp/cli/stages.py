@@ -9,28 +9,32 @@ from typing import Any
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, show
+import vd4rl_pomdp.data.formats  # noqa: F401 (registers the formats)
+from finetune.config import FinetuneConfig
+from pretrain import train as pretraining
+from pretrain.config import PretrainConfig
+from vd4rl_pomdp.cli.parsing import chosen_by, command, parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
 from vd4rl_pomdp.core.options import LABELS, Options, flat
-from vd4rl_pomdp.core.parsing import chosen_by, parse, parse_stage
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.reference import Reference, summarise
+from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.runs import EPISODES_FILE
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
+from vd4rl_pomdp.runs.files import flatten, groups
+from vd4rl_pomdp.runs.outputs import refuse_inside
 
 
 def pretrain(words: list[str], program: str) -> None:
     """Train an encoder."""
-    from pretrain.config import PretrainConfig
-    from pretrain.train import pretrain
-
-    run = pretrain(parse_stage(PretrainConfig, words, program))
+    run = pretraining.pretrain(parse_stage(PretrainConfig, words, program))
     print(f"encoder: {run.path / 'encoder'}")
 
 
 def finetune(words: list[str], program: str) -> None:
     """Train a policy, or a stack of several: WORDS + WORDS, or one per seed of `--seeds`."""
-    from finetune.config import FinetuneConfig
-    from finetune.train import finetune_all
+    from finetune.train import finetune_all  # loads OpenGL
 
     parts: list[list[str]] = [[]]
     for word in words:
@@ -89,12 +93,7 @@ class Evaluation:
 
 def evaluate(words: list[str], program: str) -> None:
     """Evaluate a fine-tuned run again, as trained and without corruption, or under a given corruption only."""
-    from finetune.evaluation import another, by_part, evaluate_run, refuse_kept
-    from vd4rl_pomdp.data.reference import Reference, summarise
-    from vd4rl_pomdp.nn.encoder_folder import read_record
-    from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
-    from vd4rl_pomdp.runs.files import flatten, groups
-    from vd4rl_pomdp.runs.outputs import refuse_inside
+    from finetune.evaluation import another, by_part, evaluate_run, refuse_kept  # loads OpenGL
 
     name = chosen_by(words, ["corruption"]).get("corruption")
 
@@ -139,11 +138,6 @@ def evaluate(words: list[str], program: str) -> None:
 @command
 def list_parts() -> None:
     """List methods, corruptions, algorithms, frame encoders, memories and tasks, one line each."""
-    import finetune.algorithms  # noqa: F401 (importing the parts fills the registries)
-    import pretrain.objectives  # noqa: F401
-    import vd4rl_pomdp.core.tasks
-    import vd4rl_pomdp.data.formats  # noqa: F401
-
     for setting, registry in sorted(REGISTRIES.items()):
         print(f"{flag_of(setting)}   (entry point group {registry.group})")
         width = max(map(len, [*registry, *registry.broken]))

@@ -8,10 +8,26 @@ from pathlib import Path
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, show
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.parsing import parse, parse_stage
+from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show
+from vd4rl_pomdp.cli.sweeps import carry_out
+from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.report import compare as comparing
+from vd4rl_pomdp.report import print_summary, write_report
+from vd4rl_pomdp.report import theory as theory_page
+from vd4rl_pomdp.report.load import ALL
 from vd4rl_pomdp.runs import NAVIGATION_FILE
+from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_kept
+from vd4rl_pomdp.runs.results import CERTIFICATES, add_results, certificate_in_words, verify_results
+from vd4rl_pomdp.studies import certify as certificates
+from vd4rl_pomdp.studies.navigation import collect as mazes
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+from vd4rl_pomdp.studies.navigation.report import write_report as write_navigation_report
+from vd4rl_pomdp.studies.navigation.train import train
+from vd4rl_pomdp.studies.theory import theory_study
+from vd4rl_pomdp.sweeps.folder import SweepFolder
+from vd4rl_pomdp.sweeps.grid import load_grid, narrow
+from vd4rl_pomdp.sweeps.members import GridMembers
+from vd4rl_pomdp.sweeps.options import LocalOptions, own_program, refuse_unknown_to_jobs
 
 
 @command
@@ -33,14 +49,8 @@ def report(
             only: Report only grid cells with these values: method=mik+a,acro seed=0.
             change: Overrides that the grid was run with: preset=cpu finetune.updates=20000.
     """
-    from vd4rl_pomdp.report import print_summary, write_report
-    from vd4rl_pomdp.report.load import ALL
-
     choice = ALL
     if grid:
-        from vd4rl_pomdp.sweeps.grid import load_grid, narrow
-        from vd4rl_pomdp.sweeps.members import GridMembers
-
         choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
     elif only or change:
         raise UserError("--only and --change select and change the cells of a grid: name it with --grid")
@@ -67,14 +77,11 @@ def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: P
         b: The same, to compare with.
         out: Also write an HTML page, CSV and LaTeX into this folder.
     """
-    from vd4rl_pomdp.report.compare import FILE, compare_results, print_comparison, write_comparison
-    from vd4rl_pomdp.runs.outputs import refuse_foreign
-
     if out is not None:
-        refuse_foreign(out, "comparison", f"{FILE}.csv")
-    comparison = compare_results(a, b)
-    page = None if out is None else write_comparison(comparison, out)
-    print_comparison(comparison)
+        refuse_foreign(out, "comparison", f"{comparing.FILE}.csv")
+    comparison = comparing.compare_results(a, b)
+    page = None if out is None else comparing.write_comparison(comparison, out)
+    comparing.print_comparison(comparison)
     if page is not None:
         print(f"comparison: {page}")
 
@@ -89,8 +96,6 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
         runs: Run folders, results folders, or folders that contain some.
         out: The results folder; created if missing.
     """
-    from vd4rl_pomdp.runs.results import add_results
-
     print(f"{out}: {add_results(_named(runs), out)}")
 
 
@@ -102,9 +107,8 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
         folder: The results folder.
         replay: Folder of a run with encoder and policy; the first episode of its last evaluation is replayed.
     """
-    from finetune.evaluation import REPLAYED
+    from finetune.evaluation import REPLAYED  # loads OpenGL
     from finetune.evaluation import replay as play_again
-    from vd4rl_pomdp.runs.results import verify_results
 
     runs, wrong = verify_results(folder)
     print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
@@ -126,20 +130,16 @@ def theory(json: bool = False, out: Path | None = None) -> None:
         json: Print one JSON object.
         out: Also write the JSON and an HTML page with figures into this folder.
     """
-    from vd4rl_pomdp.report.theory import FILE, print_theory, write_theory
-    from vd4rl_pomdp.runs.outputs import refuse_foreign
-    from vd4rl_pomdp.studies.theory import theory_study
-
     if out is not None:
-        refuse_foreign(out, "study of the theory", FILE)
+        refuse_foreign(out, "study of the theory", theory_page.FILE)
         out.mkdir(parents=True, exist_ok=True)  # fail before the computation
     study = theory_study()
     if json:
         print(json_library.dumps(study))
     else:
-        print_theory(study)
+        theory_page.print_theory(study)
     if out is not None:
-        print(f"page: {write_theory(study, out)}", file=sys.stderr if json else sys.stdout)
+        print(f"page: {theory_page.write_theory(study, out)}", file=sys.stderr if json else sys.stdout)
 
 
 @command
@@ -154,7 +154,7 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
             It takes under three minutes.
         device: Training device: auto, cpu or cuda. With --gpu and --quick, cpu tests the code without a GPU.
     """
-    from vd4rl_pomdp.bench import gpu as on_gpu
+    from vd4rl_pomdp.bench import gpu as on_gpu  # loads OpenGL
     from vd4rl_pomdp.bench.suite import GOALS, bench, print_table
 
     results = on_gpu.gpu_bench(device, quick) if gpu else bench(quick, device)
@@ -186,47 +186,34 @@ def certify(
         change: Training settings: seed=0,1,2,3,4 preset=cpu pretrain.patch_size=24 finetune.updates=60000.
         jobs: Concurrent jobs; 0: as many as the GPUs take, or one without a GPU.
     """
-    from vd4rl_pomdp.cli.sweeps import carry_out
-    from vd4rl_pomdp.core.errors import refuse_no_folder
-    from vd4rl_pomdp.runs.outputs import refuse_kept
-    from vd4rl_pomdp.runs.results import CERTIFICATES, certificate_in_words
-    from vd4rl_pomdp.studies.certify import GRID, certify, planned
-    from vd4rl_pomdp.sweeps.folder import SweepFolder
-    from vd4rl_pomdp.sweeps.options import LocalOptions, own_program, refuse_unknown_to_jobs
-
     refuse_no_folder(out)
     refuse_kept(out)
     options = LocalOptions(jobs=jobs)
     options.check()
-    dataset, cells, trainings = planned(data, corruption, out, returns, change)
+    dataset, cells, trainings = certificates.planned(data, corruption, out, returns, change)
     for training in trainings:
         refuse_unknown_to_jobs(training.settings)
     folder = SweepFolder(out)
-    carry_out([folder.keep_plan(GRID, trainings, own_program())], folder, "local", options)
-    print(f"{corruption}: {certificate_in_words(certify(dataset, cells, out, returns))}")
+    carry_out([folder.keep_plan(certificates.GRID, trainings, own_program())], folder, "local", options)
+    print(f"{corruption}: {certificate_in_words(certificates.certify(dataset, cells, out, returns))}")
     print(f"certificate: {out / CERTIFICATES}")
 
 
 def navigation_collect(words: list[str], program: str) -> None:
     """Collect a maze's data."""
-    from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig, collect
-
-    config = parse_stage(MazeCollectConfig, words, program)
-    print(f"shards in {config.out}: {len(collect(config))}")
+    config = parse_stage(mazes.MazeCollectConfig, words, program)
+    print(f"shards in {config.out}: {len(mazes.collect(config))}")
 
 
 def navigation_train(words: list[str], program: str) -> None:
     """Train an objective on a maze."""
-    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-    from vd4rl_pomdp.studies.navigation.train import train
-
     run = train(parse_stage(NavigationConfig, words, program))
     print(f"results: {run.path / NAVIGATION_FILE}")
 
 
 def navigation_policy(words: list[str], program: str) -> None:
     """Train the policy that collects the first-person maze's data."""
-    from vd4rl_pomdp.studies.navigation.drivers import FirstPersonConfig, train_first_person
+    from vd4rl_pomdp.studies.navigation.drivers import FirstPersonConfig, train_first_person  # an extra
 
     config = parse(FirstPersonConfig, words, program)
     card = train_first_person(config).card
@@ -244,7 +231,4 @@ def navigation_report(
         out: Folder of the report.
         pictures: Also draw sample observations, which needs OpenGL.
     """
-    from vd4rl_pomdp.studies.navigation.collect import sample_observations
-    from vd4rl_pomdp.studies.navigation.report import write_report
-
-    print(f"report: {write_report(_named(runs), out, sample_observations if pictures else None)}")
+    print(f"report: {write_navigation_report(_named(runs), out, mazes.sample_observations if pictures else None)}")

@@ -9,14 +9,18 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, show
+from vd4rl_pomdp.cli.parsing import command, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
-from vd4rl_pomdp.core.parsing import parse_stage
+from vd4rl_pomdp.runs.outputs import refuse_kept
+from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
+from vd4rl_pomdp.sweeps.driver import Driver, in_stacks
+from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, failed, failure, in_lines, jobs_of, plan_name, status
+from vd4rl_pomdp.sweeps.grid import SHARED, load_grid, names, narrow
 from vd4rl_pomdp.sweeps.options import (
     EXECUTORS,
     JOB_VARIABLE,
@@ -25,10 +29,8 @@ from vd4rl_pomdp.sweeps.options import (
     program_name,
     refuse_unknown_to_jobs,
 )
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
-    from vd4rl_pomdp.sweeps.plan import Job
+from vd4rl_pomdp.sweeps.plan import DATA, Job, plan_jobs, runs_kept
+from vd4rl_pomdp.sweeps.stages import check_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,13 +79,6 @@ class RunCommand(_ExecutorConfig):
 
 def run(words: list[str], program: str) -> None:
     """Run or resume a grid."""
-    # Imports are local, as in every command: torch and the simulators load slowly.
-    from vd4rl_pomdp.runs.outputs import refuse_kept
-    from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
-    from vd4rl_pomdp.sweeps.grid import SHARED, load_grid, names, narrow
-    from vd4rl_pomdp.sweeps.plan import DATA, plan_jobs, runs_kept
-    from vd4rl_pomdp.sweeps.stages import check_cells
-
     for name in SHARED:
         if flag_of(name) in (word.partition("=")[0] for word in words):
             raise UserError(f"{flag_of(name)} is a setting of the grid's trainings: change it by --change {name}=VALUE")
@@ -113,8 +108,6 @@ def run(words: list[str], program: str) -> None:
 
 def _print_plan(jobs: list[Job], stack: int) -> None:
     """Print each job as one shell line, shared jobs, and the number of processes."""
-    from vd4rl_pomdp.sweeps.driver import in_stacks
-
     users = Counter(name for job in jobs for name in job.needs)
     left: list[Job] = []
     for job in jobs:
@@ -133,10 +126,6 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
 
     `name` is the plan's, empty for all plans in the folder.
     """
-    from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
-    from vd4rl_pomdp.sweeps.driver import Driver
-    from vd4rl_pomdp.sweeps.folder import failure, jobs_of, status
-
     if JOB_VARIABLE in os.environ:
         raise UserError("a job cannot start a sweep: end the file in `main()`, which reads the job's own command line")
     if kind == "local":
@@ -166,8 +155,6 @@ def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
         out: Folder of the sweep.
         json: Print one JSON object.
     """
-    from vd4rl_pomdp.sweeps.folder import SweepFolder, in_lines, jobs_of, status
-
     folder = SweepFolder(out)
     jobs = jobs_of(folder.plans())
     found = status(jobs, folder.attempts(jobs))
@@ -187,8 +174,6 @@ class RetryCommand(_ExecutorConfig):
 
 def retry(words: list[str], program: str) -> None:
     """Retry failed jobs."""
-    from vd4rl_pomdp.sweeps.folder import SweepFolder, failed, jobs_of
-
     config = parse_stage(RetryCommand, words, program)
     folder = SweepFolder(config.out)
     plans = folder.plans_to_do()
@@ -220,9 +205,6 @@ def join(
         threads: CPU threads per job; 0: its share of the cores.
         stack: Maximum fine-tunings that one process trains as a stack, in the place of one job.
     """
-    from vd4rl_pomdp.sweeps.driver import Driver
-    from vd4rl_pomdp.sweeps.folder import SweepFolder
-
     options = LocalOptions(jobs, jobs_per_gpu, threads, stack)
     options.check()
     folder = SweepFolder(out)
@@ -233,8 +215,6 @@ def join(
 @command
 def list_grids() -> None:
     """List the grids that ship with the package."""
-    from vd4rl_pomdp.sweeps.grid import load_grid, names
-
     for name in names():
         grid = load_grid(name)
         print(f"{name:<18} {len(grid.cells()):>5} cells  {grid.title}")

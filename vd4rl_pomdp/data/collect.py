@@ -27,6 +27,7 @@ from vd4rl_pomdp.core.tasks import (
     Quality,
     Task,
 )
+from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set
 from vd4rl_pomdp.envs.make import layout_of, make_env
 from vd4rl_pomdp.envs.pixels import Render
@@ -116,8 +117,6 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
     ]
     settings = collection(config) | {"actors": actor_hashes(config)}
     collect_set(config.out, settings, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
-    from vd4rl_pomdp.data.card import write_card  # plots; not needed by the worker processes
-
     write_card(config.out)
     return [shard.path for shard in shards]
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
+from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import PLAN
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
 from vd4rl_pomdp.data.formats import FORMATS
@@ -92,8 +93,6 @@ def import_set(
                 (out / PLAN).unlink(missing_ok=True)
             raise
     _print(episodes.notes())
-    from vd4rl_pomdp.data.card import write_card  # draws
-
     write_card(out)
     return [shard.path for shard in shards]
 

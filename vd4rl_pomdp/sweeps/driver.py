@@ -18,6 +18,8 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+
 from vd4rl_pomdp.core.errors import TEMPORARY, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.runs import interrupt
@@ -298,8 +300,6 @@ def places(options: LocalOptions) -> list[Place]:
 
 def visible_gpus() -> list[str]:
     """GPUs that this process may use, as named in CUDA_VISIBLE_DEVICES."""
-    import torch
-
     count = torch.cuda.device_count()  # does not initialise CUDA
     shown = os.environ.get("CUDA_VISIBLE_DEVICES")
     return shown.split(",")[:count] if shown else [str(number) for number in range(count)]

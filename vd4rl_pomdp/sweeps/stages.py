@@ -10,9 +10,9 @@ from typing import Any
 from finetune.config import FinetuneConfig, as_trained
 from pretrain.config import PretrainConfig, history_of
 from pretrain.objectives import METHODS
+from vd4rl_pomdp.cli.parsing import parse, parse_stage
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.core.options import flat, settings_of, words_of
-from vd4rl_pomdp.core.parsing import parse, parse_stage
 from vd4rl_pomdp.core.tasks import SET_QUALITIES
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT

@@ -7,8 +7,8 @@ import torch
 
 from pretrain.train import Trainer
 from tests.helpers_data import fake_rows, write_fake_set
+from vd4rl_pomdp.cli.parsing import parse_stage
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.parsing import parse_stage
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
