@@ -18,6 +18,7 @@ from finetune.config import FinetuneConfig
 from finetune.features import FeatureSampler, StackedSampler
 from finetune.histories import Histories
 from finetune.train import finetune, finetune_all
+from finetune.trainer import FinetuneTrainer
 from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import CutError, cut_at, smoke_finetune, smoke_pretrain
@@ -192,16 +193,15 @@ def test_methods_of_one_width_stack(encoders, data, tmp_path):
 
 def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_path, capsys, monkeypatch):
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(3)]
-    make = train.make_trainer
+    build = FinetuneTrainer.build
 
-    def broken(config, *more):
-        made = make(config, *more)
-        if config.seed == 1:
-            made.sampler.data[:, -2] = float("inf")
-        return made
+    def broken(self):
+        build(self)
+        if self.config.seed == 1:
+            self.sampler.data[:, -2] = float("inf")
 
     with monkeypatch.context() as patch:
-        patch.setattr(train, "make_trainer", broken)
+        patch.setattr(FinetuneTrainer, "build", broken)
         with pytest.raises(FloatingPointError, match=rf"{tmp_path / '1'}: critic_loss is .* in the row of step 3"):
             finetune_all(configs)
     assert "the other runs go on" in capsys.readouterr().err
@@ -262,16 +262,16 @@ def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespa
     streams = [RandomStream(torch.Generator().manual_seed(10 * seed + n), device) for n in range(2)]
     algorithm = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, streams[0])
     sampler = FeatureSampler(Histories(dataset, NO_OPTIONS, 2, 0), features, 16, 2, 0.9, streams[1])
-    return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config, settle=lambda: None)
+    return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config)
 
 
 def course_of(runs: list[SimpleNamespace], updates: int) -> list[dict[str, torch.Tensor]]:
     """What each run logs and where it ends; the logs are read after the last update."""
-    step = train.Updates(runs)
+    step = train.Updates([run.algorithm for run in runs], [run.sampler for run in runs], runs[0].config)
     logs = [step(number) for number in range(updates)]
     found = []
     for number, run in enumerate(runs):
-        run.settle()
+        step.settle(number)
         own = logs if len(runs) == 1 else [{name: value[number] for name, value in row.items()} for row in logs]
         found.append(course(run.algorithm, own) | {"batches": run.sampler.draws.get_state()})
     return found
@@ -328,7 +328,7 @@ def along(name: str, data: Path, precision: str) -> SimpleNamespace:
     inner = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, streams[0])
     sampler = TransitionSampler(View(dataset, "patch+zero_frames", 4), 16, streams[1], 2, 0.9)
     algorithm = end_to_end.EndToEnd(inner, encoder, config)
-    return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config, settle=lambda: None)
+    return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config)
 
 
 GPU_UPDATES = 200

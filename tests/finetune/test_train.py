@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 from finetune import train, trainer
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FrozenEncoder
-from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
+from finetune.trainer import RESULTS
 from pretrain.train import pretrain as run_pretrain
 from tests.finetune.conftest import BRIEF
 from tests.helpers_data import write_fake_set

@@ -28,7 +28,6 @@ from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder
 from finetune.histories import Histories
 from finetune.train import Updates
-from finetune.trainer import FinetuneTrainer
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.bench.processes import JAX_MISSING, apart, make_trainer, memory, sharing, touch
@@ -447,16 +446,16 @@ def next_update(
 
     `batches` makes a sampler of (B, dim) representations from a random stream; an end-to-end method trains `encoder`.
     """
-    device, trainers = dataset.t.device, []
-    unwritten: Any = [None] * 4  # outputs, and the reference to compare results with
+    device, kind = dataset.t.device, ALGORITHMS.named(config.algorithm)
+    algorithms: list[Any] = []
+    samplers = []
     for seed in range(runs):
         draws, noise = (random_stream(seed, STAGE, name, device=device) for name in ("batches", "noise"))
         policy = Policy(dim, dataset.action_dim, config.hidden_dim).to(device)
-        kind = ALGORITHMS.named(config.algorithm)
         algorithm = kind(policy, config.options, config.learning_rate, config.updates, noise)
-        trained = algorithm if encoder is None else EndToEnd(algorithm, encoder, config)
-        trainers.append(FinetuneTrainer(trained, batches(draws), config, *unwritten))
-    updates, made = Updates(trainers), itertools.count()
+        algorithms.append(algorithm if encoder is None else EndToEnd(algorithm, encoder, config))
+        samplers.append(batches(draws))
+    updates, made = Updates(algorithms, samplers, config), itertools.count()
     return lambda: updates(next(made))
 
 
