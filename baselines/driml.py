@@ -31,7 +31,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
@@ -80,7 +80,7 @@ class DRIML(Objective):
         maps = self._frame.maps(window.obs)
         states = self.encoder.from_features(self._frame.from_maps(maps), window.prev_action)
         # CUDA graphs need the same shapes for every k: there, `real` masks the rows that have no row t+k
-        anchors = rows - (int(k) if buffers.in_host_memory(k) else 1)
+        anchors = rows - (int(k) if hardware.in_host_memory(k) else 1)
         there = torch.arange(anchors, device=k.device) + k
         real = (there < window.length[:, None]).flatten()
         there = there.clamp(max=rows - 1)

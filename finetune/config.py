@@ -12,9 +12,9 @@ import tyro
 from finetune.algorithms import ALGORITHMS
 from finetune.histories import HistoryOptions
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.core.hardware import Precision
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig, flat
 from vd4rl_pomdp.core.tasks import FRAME_SIZES, MOST_EPISODES, TASKS
-from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 
 

@@ -21,10 +21,10 @@ from torch import Tensor
 from finetune.algorithms import Algorithm
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.hardware import autocast
 from vd4rl_pomdp.core.types import Transitions
 from vd4rl_pomdp.nn.adam import Adam
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.runs.device import autocast
 
 
 class EndToEnd:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from finetune.histories import Histories, HistoryOptions, read_both_ends, read_whole
 from vd4rl_pomdp.core.errors import disk_errors
+from vd4rl_pomdp.core.hardware import Precision, autocast
 from vd4rl_pomdp.core.options import Options, flat
 from vd4rl_pomdp.core.streams import RandomStream, stacked
 from vd4rl_pomdp.core.types import Batch
@@ -25,7 +26,6 @@ from vd4rl_pomdp.data import Dataset, StateView, View
 from vd4rl_pomdp.data.view import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
-from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import content_hash, replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options
-from vd4rl_pomdp.core.seeding import stream_generator
+from vd4rl_pomdp.core.streams import stream_generator
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.nn.encoder import Encoder, Readout
 from vd4rl_pomdp.runs.files import content_hash

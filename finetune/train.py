@@ -17,9 +17,9 @@ from finetune.features import StackedSampler
 from finetune.stack import Stack
 from finetune.trainer import FinetuneTrainer
 from vd4rl_pomdp.core.errors import UserError, flag_of
+from vd4rl_pomdp.core.hardware import set_products
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.runs.device import set_products
 from vd4rl_pomdp.runs.loop import in_step, save
 from vd4rl_pomdp.runs.replay import Replay
 from vd4rl_pomdp.runs.run import RunFolder

@@ -22,9 +22,9 @@ from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
 from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from vd4rl_pomdp.core.errors import refuse_outside
+from vd4rl_pomdp.core.hardware import pick_device
 from vd4rl_pomdp.core.registry import warn_of_other_code
-from vd4rl_pomdp.core.seeding import seed_networks
-from vd4rl_pomdp.core.streams import random_stream
+from vd4rl_pomdp.core.streams import random_stream, seed_networks
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY, DMCTask
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
@@ -58,7 +58,6 @@ from vd4rl_pomdp.runs import (
     interrupt,
 )
 from vd4rl_pomdp.runs.critic import critic_of
-from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, training

@@ -11,13 +11,13 @@ import tyro
 
 from pretrain.objectives import METHODS, Method
 from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.hardware import Precision
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE
 from vd4rl_pomdp.nn.memory import MEMORIES
 from vd4rl_pomdp.nn.objective import ActionOptions
-from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 
 

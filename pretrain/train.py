@@ -6,33 +6,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from pretrain.build import build_objective, build_target
-from pretrain.config import PretrainConfig, TrainingConfig
+from pretrain.config import HiddenOptions, PretrainConfig, TrainingConfig, history_of
 from pretrain.objectives import METHODS
+from pretrain.objectives.untrained import StateOptions
 from vd4rl_pomdp.core.errors import UserError, refuse_outside
+from vd4rl_pomdp.core.hardware import autocast, pick_device, set_products
 from vd4rl_pomdp.core.options import flat, settings_of
-from vd4rl_pomdp.core.seeding import seed_networks
-from vd4rl_pomdp.core.streams import RandomStream, random_stream
+from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.streams import RandomStream, random_stream, seed_networks
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, StateView, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.adam import Adam, set_learning_rate
-from vd4rl_pomdp.nn.encoder import EncoderCard
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
-from vd4rl_pomdp.nn.frame import STATE, StateFrame
-from vd4rl_pomdp.nn.objective import Objective
+from vd4rl_pomdp.nn.frame import STATE, StateFrame, encoder_settings
+from vd4rl_pomdp.nn.memory import MemoryOptions
+from vd4rl_pomdp.nn.objective import ActionOptions, Objective
 from vd4rl_pomdp.nn.probes import held_out
 from vd4rl_pomdp.runs import METRICS_FILE
-from vd4rl_pomdp.runs.device import autocast, pick_device, set_products
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -77,6 +80,61 @@ def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
     needed = method.reads_state or method.regresses_state or config.frame_encoder == STATE
     states = dataset.state_scale() if needed else None
     return build_objective(config, dataset.action_dim, target, states, (3 * FRAME_STACK, dataset.frame_size))
+
+
+def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | None:
+    """Build the action target from the (N, A) float32 training actions; None if the method predicts no actions."""
+    options = config.options
+    if not isinstance(options, ActionOptions):
+        return None
+    # K-means is seeded by the run: the codes it finds are part of the variance between seeds
+    return make_action_target(options.action_target, actions, flat(options).get("codes", 0), config.seed)
+
+
+def build_objective(
+    config: TrainingConfig,
+    action_dim: int,
+    target: ActionTarget | None,
+    states: StateScale | None = None,
+    observation: tuple[int, int] = (3 * FRAME_STACK, FRAME_SIZE),
+) -> Objective:
+    """Build the objective of a config, with a new encoder.
+
+    Args:
+        config: the run's settings.
+        action_dim: action dimension A.
+        target: from `build_target`.
+        states: scale of the simulator states; needed if states are an input or a regression target.
+        observation: channels and image size of pixel observations, such as (9, 84).
+    """
+    method, memory, options = METHODS.named(config.method), {}, config.options
+    shape: dict[str, Any]
+    if method.reads_state or config.frame_encoder == STATE:  # raw, with noise, or standardised with hidden coordinates
+        assert states is not None
+        frame: dict[str, Any] = {}
+        if isinstance(options, StateOptions) and (options.pose_noise or options.velocity_noise):
+            frame = {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
+        if isinstance(config.frame, HiddenOptions):
+            share = config.frame.hidden_share
+            frame = {"mean": states.mean.tolist(), "std": states.std.tolist(), "hidden_share": share}
+        shape = {"frame_encoder": STATE, "channels": len(states.std), "size": 1, "frame_options": frame}
+    else:
+        channels, size = observation
+        shape = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}
+        shape |= encoder_settings(config.frame)
+    if isinstance(config.memory, MemoryOptions):
+        others = asdict(config.memory)
+        hidden, m = others.pop("hidden_dim"), others.pop("m")
+        past = method.past if m is None else m
+        memory = {
+            "history": history_of(config.method, method, getattr(config, "history", "method")),
+            "use_actions": method.use_actions,
+            "hidden_dim": hidden,
+            "history_window": 0 if past is None else past + 1,  # the m rows of the past, and row t itself
+            "memory_options": others,
+        }
+    encoder = Encoder(EncoderConfig(action_dim, **shape, **memory))
+    return method.build(encoder, states if method.regresses_state else target, options, config.seed)
 
 
 def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective) -> WindowSampler:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
-from pretrain.train import Trainer, make_batches
-from vd4rl_pomdp.core.seeding import seed_networks
+from pretrain.train import Trainer, build_objective, build_target, make_batches
+from vd4rl_pomdp.core.streams import seed_networks
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data import Dataset, View, open_dataset

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.nn.adam import Adam
 from vd4rl_pomdp.runs.replay import Replay
 
@@ -111,7 +111,7 @@ def replays(patch: pytest.MonkeyPatch, *modules: ModuleType, capture: Any = reco
 
     With `capture` None they run the same operators without being replayed.
     """
-    patch.setattr(buffers, "in_host_memory", lambda x: False)  # numpy's work would not be recorded
+    patch.setattr(hardware, "in_host_memory", lambda x: False)  # numpy's work would not be recorded
     for module in modules:
         if hasattr(module, "Replay"):
             patch.setattr(module, "Replay", partial(Replay, capture=capture))

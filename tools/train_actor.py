@@ -32,7 +32,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.core.tasks import TASKS, Task
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from finetune.histories import read_both_ends, read_whole
-from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
+from pretrain.train import build_objective, build_target
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.nn.encoder import Encoder

@@ -8,7 +8,7 @@ import torch
 
 from tests.helpers_data import write_fake_set
 from tests.recording import record
-from vd4rl_pomdp.core import buffers, compiling
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.corruptions import CORRUPTIONS, CorruptionConfig, corruption, fused
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
@@ -43,7 +43,7 @@ def expected_and_painted(dataset: Dataset, monkeypatch, config: CorruptionConfig
     """The same pixels, whichever way they are made."""
     expected = seen(dataset, config, **settings)
     with monkeypatch.context() as m:
-        m.setattr(buffers, "in_host_memory", lambda x: False)
+        m.setattr(hardware, "in_host_memory", lambda x: False)
         found = seen(dataset, config, **settings)
     for one, other in zip(expected, found, strict=True):
         assert torch.equal(one, other)
@@ -94,7 +94,7 @@ def test_equal_draws_zero_the_same_frames_by_ranks_as_by_sorting(monkeypatch):
 
 def test_torch_compiles_one_pass_as_a_whole_and_to_the_same_bits(dataset, monkeypatch):
     """A GPU compiles all of it; here its operators are traced, and those on pixels compiled if there is a compiler."""
-    monkeypatch.setattr(buffers, "in_host_memory", lambda x: False)
+    monkeypatch.setattr(hardware, "in_host_memory", lambda x: False)
     config = CorruptionConfig.of("patch+zero_frames", patch_size=5, patch_count=2, patch_fill=7, keep_newest=True)
     rows = torch.arange(24).view(4, 6)
     expected = View(dataset, config, 4).observe(rows)
@@ -113,7 +113,7 @@ def test_what_cannot_be_compiled_runs_as_it_is_written_and_that_is_told_once(mon
 
     monkeypatch.setattr(torch, "compile", refuse)
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
-    double = compiling.compiled_on_gpu()(lambda x: 2 * x)
+    double = hardware.compiled_on_gpu()(lambda x: 2 * x)
     assert [int(double(torch.tensor(3))) for _ in range(2)] == [6, 6]
     assert capsys.readouterr().err.count("is not compiled, which is slower: no compiler") == 1
 
@@ -183,7 +183,7 @@ def test_a_replayed_sampler_gives_the_batches_of_one_that_is_run(dataset, monkey
     config, steps = CorruptionConfig.of("patch+zero_frames", mode, patch_size=5), 8
     expected = [[s.sample() for _ in range(steps)] for s in samplers(dataset, config)]
     expected = [[{name: batch[name].clone() for name in batch} for batch in batches] for batches in expected]
-    monkeypatch.setattr(buffers, "in_host_memory", lambda x: False)
+    monkeypatch.setattr(hardware, "in_host_memory", lambda x: False)
     for sampler, batches in zip(samplers(dataset, config), expected, strict=True):
         held = {name: torch.empty_like(value) for name, value in batches[0].items()}
 

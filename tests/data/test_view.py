@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.core.seeding import stream_seed
-from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.core.streams import RandomStream, stream_seed
 from vd4rl_pomdp.core.types import row_key, unpack_row_key
 from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream, augmentation
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset

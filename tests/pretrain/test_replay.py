@@ -13,9 +13,9 @@ from pretrain.objectives import METHODS
 from pretrain.train import Trainer, make_batches, make_objective
 from tests.helpers_data import write_fake_set
 from tests.recording import record, replays
+from vd4rl_pomdp.core.hardware import pick_device
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
-from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.replay import EAGER_VARIABLE
 
 GPU_STEPS = 200

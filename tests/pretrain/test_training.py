@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from baselines.curl import CURL
-from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
-from pretrain.train import Trainer, make_batches, make_objective, view_of
+from pretrain.train import Trainer, build_objective, build_target, make_batches, make_objective, view_of
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.nn import Encoder, EncoderConfig

@@ -30,6 +30,7 @@ from pretrain.config import PretrainConfig
 from vd4rl_pomdp.bench.processes import JAX_MISSING, apart, make_trainer
 from vd4rl_pomdp.bench.suite import next_update, on_features, synthetic_set
 from vd4rl_pomdp.core.errors import UserError, first_line
+from vd4rl_pomdp.core.hardware import pick_device
 from vd4rl_pomdp.core.options import NO_OPTIONS, flat
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -37,7 +38,6 @@ from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import save_encoder
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.runs.replay import EAGER_VARIABLE
 

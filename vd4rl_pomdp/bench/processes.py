@@ -21,9 +21,8 @@ import torch
 from finetune.algorithms import TD3BC
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
-from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
-from pretrain.train import Trainer, make_batches
+from pretrain.train import Trainer, build_objective, build_target, make_batches
 from vd4rl_pomdp.core.errors import WorkerDiedError
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.data import Dataset, open_dataset

@@ -31,6 +31,7 @@ from finetune.train import Updates
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.bench.processes import JAX_MISSING, apart, make_trainer, memory, sharing, touch
+from vd4rl_pomdp.core.hardware import Precision, pick_device
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.streams import RandomStream, random_stream
 from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, FRAME_STACK, TASKS
@@ -44,7 +45,6 @@ from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.memory import MEMORIES
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.runs.device import Precision, pick_device
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs

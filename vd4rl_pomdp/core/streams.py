@@ -1,25 +1,54 @@
-"""A run's random numbers, drawn on the CPU from named streams: one by one or, for CUDA-graph replay, in blocks.
+"""Named random streams, all derived from a run's one seed, and their numbers one by one or in blocks.
 
-A replayed step cannot draw; it can only read memory. So a stream records what a step asks for, draws it for a block of
-steps in the order in which they would have drawn it, copies the block to the GPU at once, and serves one row per step.
+A stream's seed comes from numpy's `SeedSequence` with the hashed name as spawn key, so streams of one run, and of runs
+with different seeds, are independent. Two exceptions: dataset episodes are seeded by (seed, episode), see
+`episode_seed`, and evaluation uses fixed seeds, see `evaluation`.
+
+Numbers are drawn on the CPU. A step that is replayed as a CUDA graph cannot draw; it can only read memory. So a stream
+records what a step asks for, draws it for a block of steps in the order in which they would have drawn it, copies the
+block to the GPU at once, and serves one row per step.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.seeding import stream_generator
 
 BLOCK = 256
 """Steps per block."""
 _ALIGNED = 16
 """Alignment in bytes of each draw within a row, enough for any dtype."""
+
+
+def stream_seed(seed: int, *name: str | int) -> int:
+    """Seed in 0..2^63-1 of the stream of a run's `seed` and a path, such as ("finetune", "corruption", view)."""
+    key = [int.from_bytes(hashlib.blake2b(repr(part).encode(), digest_size=8).digest()) for part in name]
+    # Halved because torch seeds must be below 2^63.
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0]) >> 1
+
+
+def stream_generator(seed: int, *name: str | int) -> torch.Generator:
+    """A CPU torch generator at the start of a stream (see `stream_seed`)."""
+    return torch.Generator().manual_seed(stream_seed(seed, *name))
+
+
+def seed_networks(seed: int, stage: str) -> None:
+    """Seed torch's global generator. Only network initialisation uses it; all other draws use streams."""
+    torch.manual_seed(stream_seed(seed, stage, "networks"))
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Environment seed of an episode of a dataset."""
+    digest = hashlib.blake2b(f"{seed}/{episode}".encode(), digest_size=4).digest()
+    return int.from_bytes(digest, "little") & 0x7FFFFFFF
 
 
 @dataclass(frozen=True)

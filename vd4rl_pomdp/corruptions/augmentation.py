@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core import buffers
-from vd4rl_pomdp.core.buffers import BUFFERS
+from vd4rl_pomdp.core import hardware
+from vd4rl_pomdp.core.hardware import BUFFERS
 from vd4rl_pomdp.corruptions.keys import draw_integers
 
 Sharing = Literal["window", "observation"]
@@ -46,7 +46,7 @@ def draw_offset(key: Tensor, pad: int) -> Tensor:
 def by_lines(images: Tensor, pad: int) -> bool:
     """Whether images (N, ..., H, W) can be shifted by `shift_by_lines`."""
     sizes = len(images) > 2 and 0 < pad < min(images.shape[-2:])
-    return sizes and buffers.in_host_memory(images) and images.is_contiguous()
+    return sizes and hardware.in_host_memory(images) and images.is_contiguous()
 
 
 def shift_by_index(obs: Tensor, offset: Tensor) -> Tensor:

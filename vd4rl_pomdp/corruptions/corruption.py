@@ -14,11 +14,11 @@ from typing import Any, ClassVar, Literal, Protocol, Self, get_args
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_unknown
 from vd4rl_pomdp.core.options import Limits, Options, flat, refuse_options
 from vd4rl_pomdp.core.registry import Registry
-from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.corruptions.fused import drawn, drop_order, painted, tells_pixels
 from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
@@ -67,7 +67,7 @@ class Patch(Options):
         sample = torch.arange(n, device=key.device)[:, None, None]
         frame = torch.arange(k, device=key.device)[:, None]
         target, index = squares.movedim(2, 4), (sample, frame, top, left)
-        if buffers.in_host_memory(target):  # on a CPU numpy is several times faster
+        if hardware.in_host_memory(target):  # on a CPU numpy is several times faster
             target.numpy()[tuple(part.numpy() for part in index)] = self.patch_fill
         else:  # target[index] = value would copy the value from the CPU and synchronise
             target.index_put_(index, torch.full((), self.patch_fill, dtype=target.dtype, device=target.device))

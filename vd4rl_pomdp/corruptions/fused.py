@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.compiling import compiled_on_gpu
+from vd4rl_pomdp.core.hardware import compiled_on_gpu
 from vd4rl_pomdp.corruptions.augmentation import draw_offset
 from vd4rl_pomdp.corruptions.keys import derive_keys, hash_keys
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.core import hardware
 
 # SplitMix64's constants as int64: products overflow and wrap around like uint64's.
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
@@ -24,7 +24,7 @@ DRAWS = 1 << 31
 
 def hash_keys(key: Tensor) -> Tensor:
     """Hash int64 keys of any shape to int64 values that look uniform."""
-    if buffers.in_host_memory(key):  # for so few numbers numpy is much faster than torch
+    if hardware.in_host_memory(key):  # for so few numbers numpy is much faster than torch
         return torch.from_numpy(_mix(key.numpy().reshape(-1))).view(key.shape)
     return _mix(key ^ 0)  # a no-op, without which torch.compile treats `arange + constant` as 32-bit index arithmetic
 

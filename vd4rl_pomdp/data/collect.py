@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_outside, refuse_unknown
-from vd4rl_pomdp.core.seeding import episode_seed, stream_seed
+from vd4rl_pomdp.core.streams import episode_seed, stream_seed
 from vd4rl_pomdp.core.tasks import (
     FRAME_SIZE,
     FRAME_SIZES,

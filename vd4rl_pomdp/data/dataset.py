@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, refuse_number
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import TASKS
@@ -178,7 +178,7 @@ class Dataset:
 
         At the start of an episode its first frame is repeated. IndexError for a negative row.
         """
-        if buffers.in_host_memory(rows) and (rows < 0).any():  # on a GPU the check would synchronise
+        if hardware.in_host_memory(rows) and (rows < 0).any():  # on a GPU the check would synchronise
             raise IndexError(f"row {int(rows.min())} is out of range for a set of {self.num_rows} rows")
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
@@ -266,7 +266,7 @@ class Dataset:
         if number.is_floating_point() or number.dtype == torch.bool or number.ndim != 1:
             raise IndexError(f"an index is an integer or a flat list of them, not {number.dtype} of {number.ndim} axes")
         number = number.to(torch.int64)
-        if buffers.in_host_memory(number):
+        if hardware.in_host_memory(number):
             low, high = int(number.min()), int(number.max())
             if low < 0 or high >= size:
                 raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")

@@ -9,11 +9,10 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core import buffers
-from vd4rl_pomdp.core.buffers import BUFFERS
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.errors import refuse_number, refuse_unknown
-from vd4rl_pomdp.core.seeding import stream_seed
-from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.core.hardware import BUFFERS
+from vd4rl_pomdp.core.streams import RandomStream, stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import Transitions, Windows
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, augmentation
@@ -62,7 +61,7 @@ class View:
         frames = self.dataset.frames
         if augmentation.by_lines(frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
-        if not buffers.in_host_memory(frames):
+        if not hardware.in_host_memory(frames):
             index = self.dataset.stack_rows(rows, self._frame_stack).view(-1, self._frame_stack)
             obs = self.corruption.corruption.paint(frames, index, keys.flatten(), shift_key, self._pad)
             if obs is not None:
@@ -76,7 +75,7 @@ class View:
         """Stored frame stacks (..., C, H, W) uint8 of (...,) int64 rows, neither shifted nor corrupted."""
         frames = self.dataset.frames
         index = self.dataset.stack_rows(rows, self._frame_stack).flatten()
-        out = BUFFERS.take((len(index), *frames.shape[1:])) if buffers.in_host_memory(frames) else None
+        out = BUFFERS.take((len(index), *frames.shape[1:])) if hardware.in_host_memory(frames) else None
         stored = torch.index_select(frames, 0, index, out=out)
         return stored.view(*rows.shape, frames.shape[1] * self._frame_stack, *frames.shape[2:])
 

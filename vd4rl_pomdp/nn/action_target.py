@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.core.errors import UserError, refuse_unknown
 from vd4rl_pomdp.core.options import Limits, Options
-from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import stream_seed
 
 
 class ActionTarget(Protocol):

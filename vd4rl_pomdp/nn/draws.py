@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.corruptions.keys import next_keys
 
 

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core.compiling import compiled_on_gpu
 from vd4rl_pomdp.core.errors import UserError, first_line
+from vd4rl_pomdp.core.hardware import compiled_on_gpu
 from vd4rl_pomdp.core.options import Limits, Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, draw_normals

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.core import hardware
 
 _IGNORED = -100
 """Label of anchors that cross-entropy ignores."""
@@ -92,7 +92,7 @@ def share_found(scores: Tensor, group: Tensor | None = None, real: Tensor | None
 
 def _unless_all(real: Tensor | None) -> Tensor | None:
     """None if all are real; a mask on a GPU is kept, as reading it would synchronise."""
-    return None if real is not None and buffers.in_host_memory(real) and real.all() else real
+    return None if real is not None and hardware.in_host_memory(real) and real.all() else real
 
 
 def _logits(scores: Tensor, group: Tensor | None, real: Tensor | None) -> Tensor:

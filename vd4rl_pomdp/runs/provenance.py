@@ -76,7 +76,7 @@ def machine(device: str = "auto") -> dict[str, Any]:
     """Hardware of a run on a device: processor, cores, memory and GPU. No host or user names."""
     import torch
 
-    from vd4rl_pomdp.runs.device import pick_device
+    from vd4rl_pomdp.core.hardware import pick_device
 
     used = pick_device(device)
     cpuinfo = Path("/proc/cpuinfo")

@@ -27,6 +27,7 @@ from finetune.features import FrozenEncoder
 from finetune.histories import read_whole
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.hardware import pick_device
 from vd4rl_pomdp.core.options import flat, settings_of, words_of
 from vd4rl_pomdp.core.tasks import UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -36,7 +37,6 @@ from vd4rl_pomdp.nn.probes import probe_r2
 from vd4rl_pomdp.report.gates import STATE_SHARE, converged, episodes_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
-from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import Row, groups, read_json, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pretrain.config import PretrainConfig
-from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import StepType, row_key
 from vd4rl_pomdp.corruptions import (

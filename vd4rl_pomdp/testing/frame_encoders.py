@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pretrain.build import build_objective
 from pretrain.config import PretrainConfig
+from pretrain.train import build_objective
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import FrameEncoder

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
+from pretrain.train import build_objective, build_target
 from vd4rl_pomdp.core.types import Windows, previous
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.memory import Memory, make_memory, run_backward, run_memory

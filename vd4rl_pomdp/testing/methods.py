@@ -9,9 +9,9 @@ from typing import Any, cast
 
 import torch
 
-from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
+from pretrain.train import build_objective, build_target
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.types import StateWindows, Windows, previous
 from vd4rl_pomdp.corruptions import CORRUPTIONS

@@ -2,8 +2,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, assume, given, settings
 
-from pretrain.build import build_objective
 from pretrain.config import PretrainConfig
+from pretrain.train import build_objective
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths, compare

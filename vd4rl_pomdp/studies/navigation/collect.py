@@ -18,7 +18,7 @@ import torch
 
 from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside, refuse_unknown
 from vd4rl_pomdp.core.options import StageConfig
-from vd4rl_pomdp.core.seeding import episode_seed
+from vd4rl_pomdp.core.streams import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.reading import damaged, read_bytes
-from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 

@@ -21,12 +21,11 @@ import pandas as pd
 import torch
 from torch import Tensor, nn
 
-from pretrain.build import build_objective, build_target
-from pretrain.train import Trainer
+from pretrain.train import Trainer, build_objective, build_target
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.hardware import autocast, pick_device
 from vd4rl_pomdp.core.options import flat, settings_of
-from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.core.streams import random_stream
+from vd4rl_pomdp.core.streams import random_stream, seed_networks, stream_generator
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
@@ -38,7 +37,6 @@ from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
 from vd4rl_pomdp.nn.policy import Standardise
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
-from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.files import replacing_file, write_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside

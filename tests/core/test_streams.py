@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from vd4rl_pomdp.core.seeding import seed_networks, stream_generator, stream_seed
+from vd4rl_pomdp.core.streams import seed_networks, stream_generator, stream_seed
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig
 from vd4rl_pomdp.nn.draws import Draws
 

@@ -1,0 +1,133 @@
+"""The machine: devices and precision, memory for batches of frames, compiled functions."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import weakref
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.core.errors import UserError, first_line
+
+Precision = Literal["fp32", "tf32", "bf16"]
+"""Precision of matrix products. tf32: on a GPU, inputs have 10 mantissa bits, as is JAX's default; elsewhere fp32."""
+
+
+def pick_device(name: str) -> torch.device:
+    """Device named `name`; `auto` is the first GPU if there is one, else the CPU."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise UserError(f"unknown device {name!r}: use auto, cpu or cuda") from error
+    if device.type not in ("cpu", "cuda"):
+        raise UserError(f"unknown device {name!r}: use auto, cpu or cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise UserError(f"device {name!r} was asked for, but no such GPU is visible: use --device cpu")
+    return device
+
+
+def autocast(device: torch.device, precision: Precision) -> torch.autocast:
+    """Context in which a forward pass and its gradients run in `precision`.
+
+    bf16 products are accumulated in fp32 and rounded to bf16; norms and similar operations stay in fp32.
+    """
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
+
+
+def set_products(device: torch.device, precision: Precision) -> None:
+    """Set the precision of float32 matrix products on a GPU, gradients included, for the rest of this process.
+
+    PyTorch runs convolutions and recurrent layers in TF32 on a GPU regardless of this setting.
+    """
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")
+
+
+_KEPT = 4
+"""Maximum number of blocks: two per batch of transitions (obs and next_obs), for two batches."""
+
+
+def in_host_memory(x: Tensor) -> bool:
+    """Whether numpy and Python may read a tensor's values without a GPU sync.
+
+    Callers have two code paths with equal results: a faster one for the CPU, and one that CUDA graphs can capture.
+    """
+    return x.device.type == "cpu"
+
+
+class FrameBuffers:
+    """Lends blocks of CPU memory; a block is reused once no tensor refers to it.
+
+    Page-faulting fresh memory for every batch costs more time than filling it.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: list[tuple[np.ndarray, weakref.ref[np.ndarray]]] = []
+        """Each block with a weak reference to the view lent out, which dies with the last tensor that uses it."""
+        self._lock = threading.Lock()
+
+    def take(self, shape: tuple[int, ...] | torch.Size) -> Tensor:
+        """Uninitialised uint8 tensor that shares memory with no other live tensor."""
+        shape = tuple(shape)
+        with self._lock:
+            idle = [i for i, (_, view) in enumerate(self._blocks) if view() is None]
+            fitting = next((i for i in idle if self._blocks[i][0].shape == shape), None)
+            block = np.empty(shape, np.uint8) if fitting is None else self._blocks[fitting][0]
+            view = block[:]
+            if fitting is not None:
+                self._blocks[fitting] = block, weakref.ref(view)
+            elif len(self._blocks) < _KEPT:
+                self._blocks.append((block, weakref.ref(view)))
+            elif idle:
+                self._blocks[idle[0]] = block, weakref.ref(view)
+        return torch.from_numpy(view)
+
+
+BUFFERS = FrameBuffers()
+"""The only instance in a process."""
+
+
+def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator that fuses a function's kernels by torch.compile when one of its arguments is a CUDA tensor.
+
+    If compilation fails, e.g. without a C compiler, it warns once and runs the original function, available as
+    `__wrapped__`. `TORCH_COMPILE_DISABLE=1` in the environment turns compilation off. With `training` it compiles only
+    when gradients are enabled: elsewhere shapes vary, so compilation does not pay off.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        compiled, failed = None, False
+
+        @wraps(function)
+        def call(*args: Any) -> Any:
+            nonlocal compiled, failed
+            on_gpu = any(isinstance(arg, Tensor) and arg.is_cuda for arg in args)
+            if failed or not on_gpu or (training and not torch.is_grad_enabled()):
+                return function(*args)
+            try:
+                if compiled is None:
+                    from torch._functorch import config  # imported here: loading the compiler takes seconds
+
+                    config.donated_buffer = False  # else `retain_graph=True` fails
+                    compiled = torch.compile(function)
+                return compiled(*args)
+            except torch.OutOfMemoryError:
+                raise
+            except Exception as error:
+                out = function(*args)  # raises if the arguments were at fault
+                failed = True
+                line = f"warning: {function.__qualname__} is not compiled, which is slower: {first_line(error)}"
+                print(line, file=sys.stderr, flush=True)
+                return out
+
+        return call
+
+    return decorate
