@@ -20,7 +20,7 @@ from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.frame import FrameEncoderPart, FrameOptions
-from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.page import write_report
 
 BY_CALL = "registered by a call"
 EXAMPLES = {

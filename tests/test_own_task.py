@@ -27,7 +27,7 @@ from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.nn import load_encoder
-from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.episodes import read_episodes
 
 PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"

@@ -140,16 +140,16 @@ def test_members_go_on_alone_or_in_another_stack(encoder, data, tmp_path, monkey
         cut_at(patch, 2)
         with pytest.raises(CutError):
             finetune(configs["a"])  # alone; it gets as far as step 6, which is evaluated
-    told = []
+    made = []
     with monkeypatch.context() as patch:
-        init = train.Updates.__init__
+        call = train.Updates.__call__
         patch.setattr(
             train.Updates,
-            "__init__",
-            lambda self, group, *more: (told.append([t.step for t in group]), init(self, group, *more))[1],
+            "__call__",
+            lambda self, done: (made.append((len(self._samplers), done)), call(self, done))[1],
         )
         finetune_all([configs["c"], configs["a"], configs["b"]])
-    assert told == [[4, 4], [6, 6, 6]]
+    assert made == [(2, 4), (2, 5), *((3, done) for done in range(6, 12))], "those behind go first"
     for name in ("a", "b", "c"):
         same_but_for_rounding(tmp_path / name, tmp_path / f"{name} alone")
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")}

@@ -7,9 +7,9 @@ import pytest
 import scipy.stats
 
 from tests.helpers_report import describe, write_run, write_seeds
-from vd4rl_pomdp.report import print_summary, write_report
 from vd4rl_pomdp.report.gates import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 

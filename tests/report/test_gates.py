@@ -10,9 +10,9 @@ import scipy.stats
 
 from tests.helpers_report import describe, write_seeds
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import print_summary, write_report
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.runs.files import write_json
 
 DATA = 800.0

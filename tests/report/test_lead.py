@@ -9,9 +9,9 @@ import pytest
 import scipy.stats
 
 from tests.helpers_report import describe, write_seeds
-from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.gates import leads
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 800.0

@@ -5,9 +5,8 @@ import pytest
 
 from tests.helpers_report import describe, pooled, write_run
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.load import find_gaps, load_runs
-from vd4rl_pomdp.report.page import unlike
+from vd4rl_pomdp.report.page import unlike, write_report
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 

@@ -20,8 +20,9 @@ from tests.helpers_report import describe, grid, pretraining, write_run, write_s
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import figures, films, print_summary, write_report
+from vd4rl_pomdp.report import figures, films
 from vd4rl_pomdp.report.load import CONDITION
+from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.report.render import write_latex
 from vd4rl_pomdp.runs.episodes import drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json

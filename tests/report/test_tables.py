@@ -10,8 +10,9 @@ import scipy.stats
 
 from tests.helpers_report import write_run, write_seeds
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import tables, write_report
+from vd4rl_pomdp.report import tables
 from vd4rl_pomdp.report.load import CONDITION, load_runs, runs_frame
+from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import write_json
 

@@ -15,6 +15,7 @@ from vd4rl_pomdp.data import download as published
 from vd4rl_pomdp.data import transfer
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.report.browse import ViewConfig, write_view
 from vd4rl_pomdp.sweeps.options import program_name
 
 REPLAY_TOLERANCE = 1e-6
@@ -112,8 +113,6 @@ def card(set: tyro.conf.Positional[Path]) -> None:
 
 def view(words: list[str], program: str) -> None:
     """Write an HTML page to browse episodes."""
-    from vd4rl_pomdp.report.browse import ViewConfig, write_view  # loads what draws figures
-
     print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
 
 

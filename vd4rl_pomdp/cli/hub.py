@@ -10,6 +10,8 @@ import tyro
 from vd4rl_pomdp import hub
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder
+from vd4rl_pomdp.report.films import side_by_side
+from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
 
@@ -80,8 +82,6 @@ def play(
         workers: Worker processes; 0 uses every core.
     """
     from finetune.export import play_agents  # loads OpenGL
-    from vd4rl_pomdp.report.films import side_by_side  # loads what draws figures
-    from vd4rl_pomdp.report.stats import mean_interval, with_interval
 
     if film:
         refuse_inside(film)

@@ -12,9 +12,9 @@ from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show
 from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.report import compare as comparing
-from vd4rl_pomdp.report import print_summary, write_report
 from vd4rl_pomdp.report import theory as theory_page
 from vd4rl_pomdp.report.load import ALL
+from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.runs import NAVIGATION_FILE
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_kept
 from vd4rl_pomdp.runs.results import CERTIFICATES, add_results, certificate_in_words, verify_results

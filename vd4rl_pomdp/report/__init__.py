@@ -9,7 +9,3 @@ Interface for the rest of the package:
     load.Choice                 what a report covers, such as a grid's cells
     page.write_report           writes a report's folder; `figures` makes its figures
 """
-
-from vd4rl_pomdp.report.page import print_summary, write_report
-
-__all__ = ["print_summary", "write_report"]

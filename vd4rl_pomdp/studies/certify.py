@@ -28,7 +28,7 @@ from finetune.histories import read_whole
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.hardware import pick_device
-from vd4rl_pomdp.core.options import flat, settings_of, words_of
+from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.tasks import UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
@@ -41,8 +41,8 @@ from vd4rl_pomdp.runs.files import Row, groups, read_json, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.sweeps.grid import GridCell, load_grid
-from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.stages import COMMANDS, check_cells, recipe_of, recorded, told
+from vd4rl_pomdp.sweeps.plan import Job, training_job
+from vd4rl_pomdp.sweeps.stages import check_cells, recorded
 
 GRID = "certify"
 MEMORY, FLOORS, STATE = "supervised+a", ("supervised_picture", "integrator"), "state"
@@ -78,19 +78,12 @@ def planned(
         cells = [cell for cell in without if cell.value("method") != STATE]
     jobs: list[Job] = []
     for cell in cells:
-        before, values = list[str](), dict[str, object]()
+        before, values = list[Job](), dict[str, object]()
         for section in cell.chain[1:]:
             name = f"{_place(cell)}/{section}"
-            encoder = {"encoder": out / before[-1] / "encoder"} if before else {}
-            words = [
-                *COMMANDS[section],
-                *words_of(told(cell, section) | {"data": data} | encoder | {"out": out / name}),
-            ]
             values |= recorded(cell, section)
-            settings = {key: str(value) for key, value in settings_of(values).items()}
-            recipe = recipe_of(cell, section)
-            jobs.append(Job(name, section, out / name, words, list(before), settings=settings, recipe=recipe))
-            before.append(name)
+            before.append(training_job(cell, section, name, out / name, data, before, values))
+        jobs += before
     if len({job.name for job in jobs}) < len(jobs):
         raise UserError("--change lists several values of a setting: only seed may have several")
     return dataset, cells, jobs

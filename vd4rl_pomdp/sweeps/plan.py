@@ -172,6 +172,16 @@ class Job:
         return (self.folder / (CONFIG_FILE if self.section in STAGES else PLAN)).is_file()
 
 
+def training_job(
+    cell: GridCell, section: str, name: str, out: Path, data: Path, before: list[Job], values: Mapping[str, Any]
+) -> Job:
+    """The job of a cell's training in `out`, after the jobs `before` it; `values` are its settings and theirs."""
+    places = {"data": data} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
+    words = [*COMMANDS[section], *words_of(told(cell, section) | places | {"out": out})]
+    needs, settings = [job.name for job in before], _words_by_name(values)
+    return Job(name, section, out, words, needs, settings=settings, recipe=recipe_of(cell, section))
+
+
 def plan_jobs(
     cells: Iterable[GridCell], out: Path, data: Path, kept: Iterable[Result] = (), others: Iterable[Job] = ()
 ) -> tuple[list[Job], list[str]]:
@@ -243,11 +253,8 @@ class _Planner:
         else:
             name, content = self._free(_run_folder(cell, section, data.name, values), own), ""
         self._names[name] = own
-        folder = self._out / name
-        places = {"data": data.folder} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
-        words = [*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder})]
-        needs, settings = [job.name for job in before], _words_by_name(values)
-        self._jobs[key] = Job(name, section, folder, words, needs, False, settings, own, content)
+        job = training_job(cell, section, name, self._out / name, data.folder, before, values)
+        self._jobs[key] = replace(job, content=content)
         return self._jobs[key]
 
     def _free(self, name: str, own: str) -> str:

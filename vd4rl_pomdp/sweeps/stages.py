@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 from finetune.config import FinetuneConfig, as_trained
@@ -12,7 +12,7 @@ from pretrain.config import PretrainConfig, history_of
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.cli.parsing import parse, parse_stage
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
-from vd4rl_pomdp.core.options import flat, settings_of, words_of
+from vd4rl_pomdp.core.options import StageConfig, flat, settings_of, words_of
 from vd4rl_pomdp.core.tasks import SET_QUALITIES
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
@@ -33,15 +33,12 @@ COMMANDS = {
 """Command by section."""
 STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
 """Stage name in a training's record, by section."""
-_PARSERS: dict[str, Callable[[list[str], str], Any]] = {
-    "collect": partial(parse, CollectConfig),
-    "pretrain": partial(parse_stage, PretrainConfig),
-    "finetune": partial(parse_stage, FinetuneConfig),
-    "navigation_collect": partial(parse_stage, MazeCollectConfig),
-    "navigation_train": partial(parse_stage, NavigationConfig),
+_CONFIGS: dict[str, type[StageConfig]] = {
+    "pretrain": PretrainConfig,
+    "finetune": FinetuneConfig,
+    "navigation_collect": MazeCollectConfig,
+    "navigation_train": NavigationConfig,
 }
-"""Parser of each section's settings. It is the command's own, so a grid accepts and rejects what the command does, and
-gets the same recipe."""
 _READS = {"pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
 """Input folders of each stage."""
 _TAKES = {"collect": (), "navigation_collect": ("preset",)}
@@ -86,9 +83,12 @@ def config_of(cell: GridCell, section: str) -> Any:
 
 @cache
 def _parsed(section: str, words: tuple[str, ...]) -> Any:
-    """Parse a section's settings, cached across seeds."""
+    """A section's settings, cached across seeds. Read as the command does, a grid takes what the command takes."""
     line = [*words, *words_of(dict.fromkeys((*_READS.get(section, ()), "out"), "-"))]
-    return _PARSERS[section](line, " ".join(("vd4rl-pomdp", *COMMANDS[section])))
+    program = " ".join(("vd4rl-pomdp", *COMMANDS[section]))
+    return (
+        parse(CollectConfig, line, program) if section == "collect" else parse_stage(_CONFIGS[section], line, program)
+    )
 
 
 def collection_of(cell: GridCell) -> Values:

@@ -10,7 +10,7 @@ from tests.helpers_report import describe, grid, pretraining, without_figures, w
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.results import Result, add_results, find_results, read_results, read_run

@@ -7,7 +7,7 @@ import pytest
 from tests.helpers_report import write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.report.theory import table_rows
 
 OUT = "page"
