@@ -187,7 +187,12 @@ def test_seeds_that_happen_to_agree_are_no_surer_than_their_episodes():
     low, high = stats.mean_interval(scores)
     reach = scipy.stats.t.ppf(0.975, 19) * scores[0].std(ddof=1) / np.sqrt(20)
     assert (low, high) == pytest.approx((0.5 - reach, 0.5 + reach))
-    assert stats.mean_interval(np.full((3, 20), 0.5)) is None, "no spread at all tells of none"
+    for score in (0.5, 33.3, 813.2702):  # the means of 20 times 33.3 and of three of these differ by rounding
+        equal = np.full((3, 20), score)
+        assert stats.mean_interval(equal) is None, "no spread at all tells of none"
+        assert stats.difference(equal, np.full((3, 20), 22.7)) is None
+        unequal = equal + np.array([[0], [0], [1e-4]])
+        assert stats.difference(unequal, np.full((3, 20), 22.7)).p < 0.05, "a row's last digit is a spread"
 
 
 def test_starts_that_two_methods_share_are_no_part_of_their_difference():

@@ -21,6 +21,7 @@ REPLICATES = 20_000  # bootstrap samples per interval
 LEVEL, POWER = 0.05, 0.8
 """Two-sided level of all tests and intervals, and the power that defines the smallest detectable difference."""
 _LEVELS = (2.5, 97.5)  # percentiles of a 95% interval
+_ROUNDING = 1e-12  # a standard error below this share of the largest mean is the rounding of floating point
 
 Interval = tuple[float, float]
 Statistic = Callable[[np.ndarray], np.ndarray]  # (..., runs) scores -> (...) values
@@ -138,7 +139,8 @@ def _estimate(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarray]
     parts = [*seeds, *(part for part in episodes if len(part) > 1)]
     errors = np.array([part.var(ddof=1) / len(part) for part in parts])
     free = np.array([len(part) - 1 for part in parts])
-    if not errors.any():
+    # means of equal scores can differ in their last digits, which are no spread either
+    if math.sqrt(errors.sum()) <= _ROUNDING * max(np.abs(part).max() for part in parts):
         return None
     # Welch-Satterthwaite: effective degrees of freedom of a sum of estimated variances.
     return Estimate(float(middle), math.sqrt(errors.sum()), float(errors.sum() ** 2 / (errors**2 / free).sum()))
