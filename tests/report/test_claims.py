@@ -12,6 +12,7 @@ from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.results import add_results, read_results
 
 DATA = 600.0
 GOOD = {
@@ -53,6 +54,21 @@ def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
     found = scipy.stats.ttest_ind([500, 540], [310, 330], equal_var=False).confidence_interval(0.95)
     assert (rows[ACTIONS]["low"], rows[ACTIONS]["high"]) == pytest.approx(tuple(found))
     assert [row["verdict"] for row in rows.values()] == ["holds"] * 5 + ["not refuted", "", ""]
+
+
+def test_episodes_are_paired_by_their_numbers_and_not_by_their_lines(tmp_path):
+    returns = {"mik": (30.0, 55.0, 41.0, 72.0), "acro": (44.0, 21.0, 63.0, 30.0)}
+    for method, scores in returns.items():
+        for seed in range(2):
+            run = write_run(tmp_path / f"runs/{method}{seed}", method, seed, {10: [one + seed for one in scores]})
+            describe(run, {"history": "method"}, seed=seed)
+    add_results([tmp_path / "runs"], tmp_path / "rows")
+    file = tmp_path / "rows" / "episodes.csv"
+    before = judged(tmp_path / "rows")[MEMORY]
+    head, *lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join([head, *sorted(lines, key=lambda line: float(line.split(",")[10]))]))
+    assert [row["episode"] for row in read_results(tmp_path / "rows")[0].rows] == [1, 3, 0, 2], "sorted by return"
+    assert judged(tmp_path / "rows")[MEMORY] == before
 
 
 @pytest.mark.parametrize(

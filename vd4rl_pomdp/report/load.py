@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -143,9 +143,14 @@ class Run:
         return bool(self.result.encoder.get("end_to_end")) or self.method in END_TO_END
 
     @cached_property
+    def played(self) -> list[Row]:
+        """All evaluation rows by number of their episode, as differences pair episodes whatever a file's order."""
+        return sorted(self.result.rows, key=itemgetter("episode"))
+
+    @cached_property
     def rows(self) -> list[Row]:
         """Evaluation rows under the training corruption."""
-        return [row for row in self.result.rows if row["evaluated_under"] == row["corruption"]]
+        return [row for row in self.played if row["evaluated_under"] == row["corruption"]]
 
     @cached_property
     def last(self) -> list[Row]:
@@ -157,7 +162,7 @@ class Run:
     def last_clean(self) -> list[Row]:
         """Rows of its last evaluation under no corruption, whatever it was trained under; empty if there was none."""
         ends = {row["step"] for row in self.last}
-        return [row for row in self.result.rows if row["step"] in ends and row["evaluated_under"] == "none"]
+        return [row for row in self.played if row["step"] in ends and row["evaluated_under"] == "none"]
 
     @property
     def finished(self) -> bool:
@@ -372,7 +377,7 @@ def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
     rows = []
     for run in runs:
         own = run.named | {"id": run.result.id}
-        rows += [row | own | {"as_trained": row["evaluated_under"] == row["corruption"]} for row in run.result.rows]
+        rows += [row | own | {"as_trained": row["evaluated_under"] == row["corruption"]} for row in run.played]
     columns = ["id", *IDENTITY, *(name for name in COLUMNS if name not in IDENTITY), "as_trained"]
     return pd.DataFrame(rows, columns=columns).astype({"as_trained": bool})
 
