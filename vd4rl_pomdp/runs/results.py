@@ -148,6 +148,10 @@ class Result:
         """Evaluation rows, or the measures of a navigation run."""
         return self.rows or self.files.get("results", {}).get("rows", [])
 
+    def extends(self, other: Result) -> bool:
+        """Whether its measures begin with another's. Later evaluations of one policy (`evaluate --keep`) only add."""
+        return self.measured[: len(other.measured)] == other.measured
+
     @property
     def finished(self) -> bool:
         return "timing" in self.files
@@ -304,18 +308,25 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     found: dict[str, Result] = {}
     for run in runs:
         other = found.setdefault(run.id, run)
-        if other.ending and other.ending == run.ending and other.measured != run.measured:
+        if other.ending and other.ending == run.ending and not (run.extends(other) or other.extends(run)):
             raise UserError(f"{run.path} and {other.path}: two runs of one method, setting and seed; name one of them")
-        # Of two copies of a run, prefer a finished, then a diverged one; then a run folder; then the one further along.
-        found[run.id] = max(other, run, key=lambda one: (one.ending, one.folder, len(one.measured), one.step))
+        found[run.id] = max(other, run, key=_completeness)
     return list(found.values())
+
+
+def _completeness(run: Result) -> tuple[int, int, bool, int, int]:
+    """Sort key of two copies of a run: a finished, then a diverged one; of those the one that was evaluated more; then
+    a run folder, which alone is up to date while the run continues; then the one further along."""
+    played = len(run.measured)
+    return run.ending, played if run.ending else 0, run.folder, played, run.step
 
 
 def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
     """Append the runs at or below some paths to a results folder, and return a summary in words.
 
     Existing rows never change, except that an unfinished run is replaced by its finished or diverged version, and a
-    diverged one by its finished version. UserError as in `find_results`, or if `out` holds something else or is in use.
+    diverged one by its finished version. Later evaluations of a run that is there are added to it. UserError as in
+    `find_results`, or if `out` holds something else or is in use.
     """
     out = Path(out)
     refuse_foreign(out, "results", RUNS, "README.md", "grid.toml")  # page and grid may exist before the first run
@@ -324,15 +335,19 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
         there = _stored(out)
         ended = [run for run in found if run.ending]
         fresh = {run.id: run for run in ended if run.id not in there or run.ending > there[run.id].ending}
-        if fresh:
-            write_results(out, (there | fresh).values())
+        again = [run for run in ended if run.id not in fresh]
+        longer = {run.id: run for run in again if run.extends(there[run.id]) and not there[run.id].extends(run)}
+        if fresh or longer:
+            write_results(out, (there | fresh | longer).values())
         keep_certificates(out, certificates_of(found, map(Path, paths), out))
-    again = [run for run in ended if run.id not in fresh]
-    known = sum(run.measured == there[run.id].measured for run in again)
+    known = sum(there[run.id].extends(run) for run in again)
     counts = {
         f"run{'s' * (len(fresh) != 1)} added": len(fresh) or "0",
         "there already": known,
-        "there already with other rows, which stay (remove their lines to replace them)": len(again) - known,
+        "there already, with later evaluations added": len(longer),
+        "there already with other rows, which stay (remove their lines to replace them)": (
+            len(again) - known - len(longer)
+        ),
         "unfinished and left out": len(found) - len(ended),
     }
     return ", ".join(f"{number} {what}" for what, number in counts.items() if number)
@@ -472,5 +487,5 @@ def refuse_loss(runs: Sequence[Result], out: Path) -> None:
         raise UserError(f"{out}: holds the results of {len(lost)} runs that would be lost; {what}")
     for run in there:
         other = written[run.id]
-        if run.measured != other.measured and other.ending <= run.ending:
+        if not other.extends(run) and other.ending <= run.ending:
             raise UserError(f"{out}: holds other rows of run {run.id}, which would be lost; choose another --out")

@@ -11,7 +11,7 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report.page import write_report
-from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.results import Result, add_results, find_results, read_results, read_run
 from vd4rl_pomdp.runs.run import identity
@@ -163,6 +163,32 @@ def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(
     assert add_results([diverged], tmp_path / "out").startswith("0 runs added, 1 there already with other rows"), (
         "and never the other way round"
     )
+
+
+def test_later_evaluations_of_a_run_are_added_to_its_rows(tmp_path):
+    """As by `evaluate --keep`: the earlier rows stay, so nothing contradicts them or would be lost."""
+    run = whole_run(tmp_path / "runs/0")
+    add_results([run], tmp_path / "out")
+    write_report([run], tmp_path / "report")
+    earlier = shutil.copytree(tmp_path / "out", tmp_path / "earlier")
+    kept = [
+        row | {"evaluated_under": "truncate", "score": 1.0, "return": 10.0}
+        for row in read_episodes(run / "episodes.csv")
+    ]
+    append_episodes(run / "episodes.csv", kept[-1:])
+    for paths in ([run, earlier], [earlier, run]):
+        assert [len(found.rows) for found in find_results(paths)] == [3], "the copy that was evaluated more"
+    write_report([run], tmp_path / "report")
+    assert add_results([run], tmp_path / "out") == "0 runs added, 1 there already, with later evaluations added"
+    for out in ("report", "out"):
+        assert read_results(tmp_path / out)[0].rows == read_run(run).rows
+    assert add_results([earlier], tmp_path / "out") == "0 runs added, 1 there already", (
+        "an earlier copy takes none away"
+    )
+    assert len(read_results(tmp_path / "out")[0].rows) == 3
+    assert [found.path for found in find_results([tmp_path / "out", earlier])] == [tmp_path / "out"]
+    with pytest.raises(UserError, match="report: holds other rows of run"):
+        write_report([earlier], tmp_path / "report")
 
 
 def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
