@@ -211,12 +211,10 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
         return [next(batches).key.tolist() for batches in [iter(sampler)] for _ in range(count)]
 
     def transitions(seed):
-        return TransitionSampler(
-            View(dataset, frame_stack=1), 64, RandomStream(torch.Generator().manual_seed(seed)), n_step=2
-        )
+        return TransitionSampler(View(dataset, frame_stack=1), 64, torch.Generator().manual_seed(seed), n_step=2)
 
     def windows(seed):
-        return WindowSampler(View(dataset, frame_stack=1), 64, 2, RandomStream(torch.Generator().manual_seed(seed)))
+        return WindowSampler(View(dataset, frame_stack=1), 64, 2, torch.Generator().manual_seed(seed))
 
     for make in (transitions, windows):
         first = draws(make(0), 30)

@@ -194,10 +194,11 @@ class Sampler(ABC):
     Random numbers are drawn on the CPU, so the batches do not depend on the data set's device.
     """
 
-    def __init__(self, source: Dataset | View, batch_size: int, draws: RandomStream) -> None:
+    def __init__(self, source: Dataset | View, batch_size: int, draws: RandomStream | torch.Generator) -> None:
         refuse_number("batch_size", batch_size, 1)
         self.view = source if isinstance(source, View) else View(source)
-        self._batch_size, self.draws = batch_size, draws
+        self._batch_size = batch_size
+        self.draws = RandomStream(draws) if isinstance(draws, torch.Generator) else draws
 
     def state_dict(self) -> dict[str, Any]:
         return {"batches": self.draws.get_state(), "view": self.view.state_dict()}
@@ -221,7 +222,9 @@ class Sampler(ABC):
 class WindowSampler(Sampler):
     """Samples windows of `length` rows."""
 
-    def __init__(self, source: Dataset | View, batch_size: int, length: int, draws: RandomStream) -> None:
+    def __init__(
+        self, source: Dataset | View, batch_size: int, length: int, draws: RandomStream | torch.Generator
+    ) -> None:
         super().__init__(source, batch_size, draws)
         self._length, self._count = length, self.view.dataset.num_windows(length)
 
@@ -236,7 +239,7 @@ class TransitionSampler(Sampler):
         self,
         source: Dataset | View,
         batch_size: int,
-        draws: RandomStream,
+        draws: RandomStream | torch.Generator,
         n_step: int = 1,
         gamma: float = 0.99,
     ) -> None:
