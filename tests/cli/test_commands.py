@@ -40,6 +40,8 @@ SLIPS = [
     (["data", "check", ""], "a word is empty: is a shell variable unset?"),
     (["sweep", "run", "quick", "--out", "x", "--only"], "--only has no value: is a shell variable unset?"),
     (["report", "x", "--only", "--out", "y"], "--only has no value: is a shell variable unset?"),
+    (["certify", "x", "patch", "--out", "y", "--change", "preset=cpu", "--change=seed=0"], "--change is given twice"),
+    (["finetune", "--seeds", "0", "--seeds=1", "--out", "y"], "--seeds is given twice"),
     (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
     (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),

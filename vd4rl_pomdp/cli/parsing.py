@@ -52,7 +52,15 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
         # tyro accepts an empty list, and `sweep run GRID --only $UNSET` would run everything
         if after.startswith("--") and parsed_values.get(word.removeprefix("--").replace("-", "_")) in ([], ()):
             raise UserError(f"{word} has no value: is a shell variable unset? (see `{program} --help`)")
+    for name in (name for name, value in parsed_values.items() if isinstance(value, list | tuple)):
+        refuse_repeated(flag_of(name), words)
     return parsed
+
+
+def refuse_repeated(flag: str, words: Iterable[str]) -> None:
+    """Raise UserError if a flag of several values is on a command line twice: only the last ones would count."""
+    if sum(word.partition("=")[0].replace("_", "-") == flag for word in words) > 1:
+        raise UserError(f"{flag} is given twice: give all its values after one {flag}")
 
 
 def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:

@@ -13,7 +13,7 @@ import vd4rl_pomdp.data.formats  # noqa: F401 (registers the formats)
 from finetune.config import FinetuneConfig
 from pretrain import train as pretraining
 from pretrain.config import PretrainConfig
-from vd4rl_pomdp.cli.parsing import chosen_by, command, parse, parse_stage, show
+from vd4rl_pomdp.cli.parsing import chosen_by, command, parse, parse_stage, refuse_repeated, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
 from vd4rl_pomdp.core.options import LABELS, Options, flat
 from vd4rl_pomdp.core.registry import REGISTRIES
@@ -57,6 +57,7 @@ def _of_seeds(words: list[str]) -> list[list[str]]:
     given, rest = reader.parse_known_args(words)
     if given.seeds is None:
         return [words]
+    refuse_repeated("--seeds", words)
     seeds = given.seeds.split(",")
     if not all(seed.isdecimal() for seed in seeds) or len(set(seeds)) < len(seeds):
         raise UserError(f"--seeds is {given.seeds!r}: give different whole numbers, as in --seeds 0,1,2")
