@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.report import load
 from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
-from vd4rl_pomdp.report.load import PROBES, TOLD_STATES, Run, episodes_frame, load_runs, runs_frame
+from vd4rl_pomdp.report.load import PROBES, TRAINED_ON_STATES, Run, episodes_frame, load_runs, runs_frame
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, number, with_interval
 from vd4rl_pomdp.report.tables import aggregate, evaluations, improvement
 from vd4rl_pomdp.runs.episodes import read_episodes
@@ -109,7 +109,7 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
     rows = []
     for place, corruption, here in _measured_sets(runs):
         # the best method with at least two seeds, without references and methods trained on states
-        methods = {run.method for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
+        methods = {run.method for run in here} - {"mik+a", "state", UNTRAINED, *TRAINED_ON_STATES}
         known = {method: seeds for method in methods if len(seeds := _of(here, method, corruption)) > 1}
         other = max(known, key=lambda method: returns_of(known[method]).mean())
         for clean, words in ((False, "as trained"), (True, "clean")):
@@ -189,7 +189,7 @@ def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
 def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
     """Rank correlation of policy diagnostics with returns on each dataset, with and without untrained encoders."""
     frame, rows = runs_frame(runs), []
-    frame = frame[frame[PROBES[0]].notna() & ~frame["method"].isin(TOLD_STATES)]  # with a held-out probe
+    frame = frame[frame[PROBES[0]].notna() & ~frame["method"].isin(TRAINED_ON_STATES)]  # with a held-out probe
     for row in _judged(runs):
         places = ["task", "quality", "corruption"]
         probed = frame[(frame[places] == [row[name] for name in places]).all(axis=1)]

@@ -105,8 +105,8 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
     refuse_inside(folder)
     staged = folder.with_name(f".{folder.name}.pull")
     with _hub(repository) as (api, where), tempfile.TemporaryDirectory() as scratch:
-        told = api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=scratch)
-        listing, license, kind = _read_listing(Path(told), kind, repository)
+        downloaded = api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=scratch)
+        listing, license, kind = _read_listing(Path(downloaded), kind, repository)
         if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
             others = {shard.name for shard in shard_files(folder)} - listing.keys()  # extra shards: another data set
             if folder.is_dir() and not others and not _wrong(folder, listing):

@@ -29,14 +29,14 @@ def noisy_set(folder: Path, lengths: list[int], size: int) -> Path:
     return folder
 
 
-def told_by(page: Path) -> dict:
-    return json.loads(re.search(r'<script type="application/json" id="told">(.*?)</script>', page.read_text())[1])
+def content_of(page: Path) -> dict:
+    return json.loads(re.search(r'<script type="application/json" id="content">(.*?)</script>', page.read_text())[1])
 
 
-def pixels(sheet: str, told: dict, count: int) -> np.ndarray:
+def pixels(sheet: str, content: dict, count: int) -> np.ndarray:
     """(count, S, S, C) pictures of a sheet."""
-    image, size = np.asarray(Image.open(io.BytesIO(base64.b64decode(sheet)))), told["size"]
-    cells = [divmod(i, told["columns"]) for i in range(count)]
+    image, size = np.asarray(Image.open(io.BytesIO(base64.b64decode(sheet)))), content["size"]
+    cells = [divmod(i, content["columns"]) for i in range(count)]
     return np.stack([image[y * size : (y + 1) * size, x * size : (x + 1) * size] for y, x in cells])
 
 
@@ -45,11 +45,11 @@ def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_
     folder = noisy_set(tmp_path / "walker_walk" / "expert", [7, 1, 12], size)
     words = ["--corruption", "patch+zero_frames", "--patch-fill", "9", "--zeroed-frames", "1", "--seed", "3"]
     main(["data", "view", str(folder), "--out", str(tmp_path / "new" / "view.html"), *words])
-    told, data = told_by(tmp_path / "new" / "view.html"), open_dataset(folder)
-    assert [(e["number"], e["length"]) for e in told["episodes"]] == [(0, 7), (1, 1), (2, 12)]
+    content, data = content_of(tmp_path / "new" / "view.html"), open_dataset(folder)
+    assert [(e["number"], e["length"]) for e in content["episodes"]] == [(0, 7), (1, 1), (2, 12)]
     hidden = make_corruption(CorruptionConfig.of("patch+zero_frames", patch_fill=9, zeroed_frames=1))
     pretraining = View(data, CorruptionConfig.of("patch", "emission"), seed=3).corruption
-    for episode in told["episodes"]:
+    for episode in content["episodes"]:
         rows = data.rows_of(episode["number"]).start + torch.tensor(episode["rows"])
         key = torch.tensor(list(map(int, episode["keys"])))
         assert torch.equal(key, derive_keys(pretraining.stream.seed, data.keys(rows))), "what runs of this seed see"
@@ -58,13 +58,13 @@ def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_
             x.reshape(-1, 3, size, size)[..., ::every, ::every].permute(0, 2, 3, 1).numpy()
             for x in (stacks, hidden(stacks, key))
         )
-        over = pixels(episode["over"], told, len(clean))
+        over = pixels(episode["over"], content, len(clean))
         assert np.array_equal(np.where(over[..., 3:] > 0, over[..., :3], clean), seen)
-        frames = pixels(episode["clean"], told, max(map(max, episode["frames"])) + 1)
+        frames = pixels(episode["clean"], content, max(map(max, episode["frames"])) + 1)
         lossy = frames[np.array(episode["frames"]).flatten()].astype(float)
         assert np.corrcoef(lossy.flatten(), clean.flatten())[0, 1] > 0.5, "noise, at a low quality"
         for name, values in (("action", data.action), ("reward", data.reward[:, None])):
-            low, high = told[name]
+            low, high = content[name]
             shown = np.frombuffer(base64.b64decode(episode[name]), np.uint8).reshape(values.shape[1], -1)
             stored = values[data.rows_of(episode["number"])].T
             np.testing.assert_allclose(low + shown / 255 * (high - low), stored, atol=(high - low) / 500)
@@ -73,10 +73,10 @@ def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_
 def test_a_hundred_episodes_fit_in_5_MB_and_need_no_network(tmp_path):
     folder = noisy_set(tmp_path / "cheetah_run" / "random", [40] * 120, 48)
     main(["data", "view", str(folder), "--out", str(tmp_path / "view.html")])
-    page, told = (tmp_path / "view.html").read_text(), told_by(tmp_path / "view.html")
+    page, content = (tmp_path / "view.html").read_text(), content_of(tmp_path / "view.html")
     assert 3_500_000 < len(page.encode()) < 5_000_000
-    assert len({e["number"] for e in told["episodes"]}) == len(told["episodes"]) == 100
-    shown = {len(e["rows"]) for e in told["episodes"]}
+    assert len({e["number"] for e in content["episodes"]}) == len(content["episodes"]) == 100
+    shown = {len(e["rows"]) for e in content["episodes"]}
     assert shown <= set(range(2, 40))
     assert f"of an episode of 40 rows {max(shown)} are shown" in page
     assert "100 of 120 episodes, evenly spaced" in page
@@ -84,7 +84,7 @@ def test_a_hundred_episodes_fit_in_5_MB_and_need_no_network(tmp_path):
 
 
 def _data(page: str) -> tuple[str, str]:
-    return re.search(r'id="told">(.*?)</script>', page)[1], ""
+    return re.search(r'id="content">(.*?)</script>', page)[1], ""
 
 
 def test_a_page_replaces_a_page_and_nothing_else(tmp_path, capsys):

@@ -94,7 +94,7 @@ def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
     """Render the page with `rows` rows of each shown episode."""
     data = view.dataset
     longest = data.longest_episode
-    told = {
+    content = {
         "size": -(-data.frame_size // -(-data.frame_size // _LARGEST)),
         "columns": COLUMNS,
         "stack": FRAME_STACK,
@@ -102,7 +102,7 @@ def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
         "action": [float(data.action.min()), float(data.action.max())],
         "reward": [float(data.reward.min()), float(data.reward.max())],
     }
-    episodes = [_episode(view, number, rows, told) for number in shown]
+    episodes = [_episode(view, number, rows, content) for number in shown]
     settings = flat(config.corruption)
     name = settings.pop("corruption")
     return render(
@@ -114,11 +114,11 @@ def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
         longest=longest,
         quality=_QUALITY,
         corrupted=name != "none",
-        told=told | {"episodes": episodes},
+        content=content | {"episodes": episodes},
     ).encode(errors="backslashreplace")
 
 
-def _episode(view: View, number: int, rows: int, told: Row) -> Row:
+def _episode(view: View, number: int, rows: int, content: Row) -> Row:
     """An episode's data for the page's script."""
     data, place = view.dataset, view.dataset.rows_of(number)
     chosen = torch.from_numpy(np.unique(np.linspace(place.start, place.stop - 1, rows).astype(int)))
@@ -138,8 +138,8 @@ def _episode(view: View, number: int, rows: int, told: Row) -> Row:
         "frames": index.tolist(),
         "clean": _sheet(_pictures(data.frames[frames]), quality=_QUALITY),
         "over": _sheet(over, lossless=True) if changed.any() else "",
-        "action": _bytes(data.action[place][:: told["every"]].T, *told["action"]),
-        "reward": _bytes(data.reward[place][:: told["every"]], *told["reward"]),
+        "action": _bytes(data.action[place][:: content["every"]].T, *content["action"]),
+        "reward": _bytes(data.reward[place][:: content["every"]], *content["reward"]),
     }
 
 

@@ -124,8 +124,8 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side['others']} unfinished or diverged" if side["others"] else ""
-        told = f"{name}: {side['path']}, {side['finished']} finished runs{others}"
-        console.print(told, markup=False, highlight=False)
+        line = f"{name}: {side['path']}, {side['finished']} finished runs{others}"
+        console.print(line, markup=False, highlight=False)
     shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
     method = shown["method"] + "\n  " + shown.pop("settings, A → B")
     for place, part in shown.assign(method=method).groupby("setting", sort=False):

@@ -178,11 +178,11 @@ def _by_label(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     return ((str(name), mine) for name, mine in rows.groupby("label", sort=False))
 
 
-def _told(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 1) -> str:
+def _in_words(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 1) -> str:
     """A figure's content in words: the last value of each method."""
     known = [(title, _by_label(rows[rows[value].notna()])) for title, rows in places]
-    told = ((title, (f"{name} {rows[value].iloc[-1]:.{digits}f}" for name, rows in lines)) for title, lines in known)
-    return "; ".join(f"{title}: {', '.join(words)}" for title, words in told)
+    texts = ((title, (f"{name} {rows[value].iloc[-1]:.{digits}f}" for name, rows in lines)) for title, lines in known)
+    return "; ".join(f"{title}: {', '.join(words)}" for title, words in texts)
 
 
 def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
@@ -287,8 +287,8 @@ def _plots(
     for corruption, rows, places in _figures(table):
         panels = [(titles.get(place, place), members, draw) for place, members in places]
         figure = sheet(panels, columns, [height(members) for _, members in places])
-        told = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows['seeds'])}"
-        plots.append(Plot(file_name(name, corruption), told, _told(places, value), figure, shown(rows)))
+        text = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows['seeds'])}"
+        plots.append(Plot(file_name(name, corruption), text, _in_words(places, value), figure, shown(rows)))
     return plots
 
 
@@ -312,7 +312,7 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
         + "; ".join(f"{name} under {corruption}: {tasks} of {of} tasks" for corruption, name, tasks, of in partial)
     ).strip()
     middle = [(title, members[members["threshold"] <= 50]) for title, members in panels]
-    words = f"Share of runs above 50: {_told(middle, 'share', 2)}"
+    words = f"Share of runs above 50: {_in_words(middle, 'share', 2)}"
     figure = sheet([(title, members, draw) for title, members in panels], 2)
     return [Plot("profiles", caption, words, figure, shown)]
 
@@ -364,7 +364,7 @@ DOTS = {
 
 def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot]:
     """Return over probe errors or action errors: one dot per run, two panels per setting."""
-    measures, axis, told = DOTS[name]
+    measures, axis, description = DOTS[name]
 
     def draw(column: str, many: bool, axes: Axes, rows: pd.DataFrame) -> None:
         for label, mine in _by_label(rows[rows[column].notna()]):
@@ -383,10 +383,10 @@ def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot
             for title, members in places
             for column, words in measures.items()
         ]
-        caption = f"Final return under {corruption} against {told}; further left is better. One dot a run, "
+        caption = f"Final return under {corruption} against {description}; further left is better. One dot a run, "
         caption += f"n = {len(rows)} runs."
         shown = rows[[*SETTING, "label", "seed", *measures, "return"]].rename(columns={"label": "method"})
-        words, figure = f"Returns: {_told(places, 'return', 0)}", sheet(panels, 4 if len(places) > 1 else 2)
+        words, figure = f"Returns: {_in_words(places, 'return', 0)}", sheet(panels, 4 if len(places) > 1 else 2)
         plots.append(Plot(file_name(name, corruption), caption, words, figure, shown))
     return plots
 
@@ -407,6 +407,6 @@ def cost_plots(costs: pd.DataFrame) -> list[Plot]:
         "Cost of pretraining and fine-tuning: mean wall-clock time over a method's finished runs of all settings, on "
         f"the machines of the table. {seeds_note(rows['runs'], 'run')}"
     )
-    words = _told([("seconds of fine-tuning", rows.assign(label=rows["method"]))], "finetune_seconds", 0)
+    words = _in_words([("seconds of fine-tuning", rows.assign(label=rows["method"]))], "finetune_seconds", 0)
     figure = sheet([("mean minutes of a run", rows, draw)], 1, [0.4 + 0.2 * len(rows)])
     return [Plot("costs", caption, words, figure, rows)]

@@ -138,8 +138,8 @@ def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple
     found = {}
     for place, mine in groups((run for run in runs if run.rows), lambda run: run.of(SETTING)).items():
         names = dict.fromkeys(run.result.certificate for run in mine)
-        told = (certificate_in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
-        found[place] = "; ".join(dict.fromkeys(told))
+        texts = (certificate_in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
+        found[place] = "; ".join(dict.fromkeys(texts))
     return found
 
 

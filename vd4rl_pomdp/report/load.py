@@ -44,9 +44,9 @@ CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_
 MISSING = "missing"
 STATE = "state"  # the privileged method, which sees the simulator state whatever the setting hides
 END_TO_END = ("bc", "drq_bc")  # baselines that are trained end to end by their own algorithm
-TOLD_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
+TRAINED_ON_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
 """Methods whose encoders are trained on simulator states, including those of the probes' held-out episodes."""
-REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, STATE)
+REFERENCES = ("random", "bc", "drq_bc", *TRAINED_ON_STATES, STATE)
 """Reference methods (lower and upper bounds), last in a table."""
 
 Settings = dict[str, str]  # values as text, by displayed name
@@ -176,8 +176,8 @@ class Run:
     @property
     def converged(self) -> bool | None:
         """Whether its critic converged, by `CONVERGED`; True for an algorithm without critic, None if not recorded."""
-        told = self.result.files.get("critic", {} if self.labels["algorithm"] == "bc" else None)
-        if told == {} and "gamma" not in self.record["config"]:  # algorithms with a discount have a critic
+        critic = self.result.files.get("critic", {} if self.labels["algorithm"] == "bc" else None)
+        if critic == {} and "gamma" not in self.record["config"]:  # algorithms with a discount have a critic
             return True
         moved = self.measures["critic_moved"]
         return None if moved is None else abs(moved) < CONVERGED
@@ -220,7 +220,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
 
     UserError if there is no run, two have the same identity, or a file of one is damaged.
     """
-    runs = _told_apart([_load(result) for result in choice.among(find_results(paths, but))])
+    runs = _distinguished([_load(result) for result in choice.among(find_results(paths, but))])
     seen: dict[tuple[Any, ...], Path] = {}
     for run in runs:
         path = run.result.path
@@ -234,17 +234,17 @@ def _load(result: Result) -> Run:
     with damaged(result.place, *DAMAGED):
         probe, stored = result.files.get("probe", {}), result.files.get("reference")
         critic = result.files.get("critic", {})
-        told = {"action_loss": result.encoder.get("action_loss")} | {name: probe.get(name) for name in PROBES}
-        told |= {name: critic.get(key) for name, key in CRITIC.items()}
-        told["pretrain_seconds"] = result.files.get("pretrain_timing", {}).get("seconds")
-        told["finetune_seconds"] = result.files["timing"]["seconds"] if result.finished else None
-        if wrong := [value for value in told.values() if value is not None and not isinstance(value, int | float)]:
+        measures = {"action_loss": result.encoder.get("action_loss")} | {name: probe.get(name) for name in PROBES}
+        measures |= {name: critic.get(key) for name, key in CRITIC.items()}
+        measures["pretrain_seconds"] = result.files.get("pretrain_timing", {}).get("seconds")
+        measures["finetune_seconds"] = result.files["timing"]["seconds"] if result.finished else None
+        if wrong := [value for value in measures.values() if value is not None and not isinstance(value, int | float)]:
             raise TypeError(f"{wrong[0]!r} is not a number")
         reference = Reference() if stored is None else Reference.parse(result.path / REFERENCE_FILE, stored)
-        return Run(result, result.labels, read_settings(result.record, result.card), reference, told)
+        return Run(result, result.labels, read_settings(result.record, result.card), reference, measures)
 
 
-def _told_apart(runs: list[Run]) -> list[Run]:
+def _distinguished(runs: list[Run]) -> list[Run]:
     """Set each run's `parts`, and append to its corruption the options that differ among runs of that corruption."""
     sets, names = [run.set_name for run in runs], [run.labels["corruption"] for run in runs]
     stages = [(run.stage, run.labels["algorithm"]) for run in runs]
@@ -253,8 +253,8 @@ def _told_apart(runs: list[Run]) -> list[Run]:
     hiding = without_sets([of_corruption(run.settings) for run in runs], sets, [""] * len(runs))
     own = without_sets([without(run.settings, of_corruption(run.settings)) for run in runs], sets, stages)
     options = [{name.removeprefix(OF_CORRUPTION): value for name, value in one.items()} for one in hiding]
-    told = zip(names, differences(options, names), strict=True)
-    corruptions = [name if name == "none" else ", ".join(filter(None, (name, what))) for name, what in told]
+    described = zip(names, differences(options, names), strict=True)
+    corruptions = [name if name == "none" else ", ".join(filter(None, (name, what))) for name, what in described]
     of_methods = differences([without(one, DATA) for one in own], methods)
     # Different datasets always differ in fingerprint; only different contents of the same dataset matter.
     data = [{name: one[name] for name in DATA if name in one} for one in own]
@@ -365,8 +365,8 @@ def a_set_a_seed(runs: Sequence[Run]) -> bool:
     if not all(plans) or len(found) < 2 or any(len(set(column)) < len(found) for column in zip(*found, strict=True)):
         return False
     drawn = [(plan.get("rendered_by") or {}).get("canary") for plan in plans]
-    told = [without(plan, ("seed", "rendered_by")) | {"drawn": one} for plan, one in zip(plans, drawn, strict=True)]
-    return all(one == told[0] for one in told)
+    compared = [without(plan, ("seed", "rendered_by")) | {"drawn": one} for plan, one in zip(plans, drawn, strict=True)]
+    return all(one == compared[0] for one in compared)
 
 
 def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
@@ -479,5 +479,5 @@ def _expected(mine: list[Run], setting: tuple[str, ...]) -> Iterator[str]:
 def gaps_in_words(gaps: Iterable[Row]) -> str:
     """Gaps of one condition: "seeds 1, 2 missing; seed 3 unfinished at 20 of 40 updates"."""
     by_state = groups(sorted(gaps, key=lambda row: row["state"]), lambda row: str(row["state"]))
-    told = {state: [str(row["seed"]) for row in members] for state, members in by_state.items()}
-    return "; ".join(f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)} {state}" for state, seeds in told.items())
+    seeds_by_state = {state: [str(row["seed"]) for row in members] for state, members in by_state.items()}
+    return "; ".join(f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)} {state}" for state, seeds in seeds_by_state.items())

@@ -221,10 +221,10 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame) -> Iterator[Bloc
                 yield block(str(heading), columns, words, seeds_note(mine["seeds"]))
         else:
             note = seeds_note(mine["seeds"])
-            told = " and ".join(method for method in dict.fromkeys(mine["method"]) if method in load.TOLD_STATES)
-            if name == "representations" and told:
+            privileged = " and ".join(method for method in dict.fromkeys(mine["method"]) if method in load.TRAINED_ON_STATES)
+            if name == "representations" and privileged:
                 # A linear probe trivially reads out what the encoder was trained to predict.
-                note += f" {told}: trained on the states of all episodes, those that the probe holds out, too, but for"
+                note += f" {privileged}: trained on the states of all episodes, those that the probe holds out, too, but for"
                 note += " --hold-out."
             if name == MARK:
                 note += f" Memory: {mine['memory'].iloc[0]}."
@@ -409,7 +409,7 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     console = console or Console()
     lines = [f"{with_algorithm(row)}: {row['verdict']}" for row in report.gates]
     tallies = {claim: tally(rows) for claim, rows in groups(report.claims, claim_of).items()}
-    lines += [f"{claim}: {told}" for claim, told in tallies.items() if told]
+    lines += [f"{claim}: {text}" for claim, text in tallies.items() if text]
     for line in (*lines, f"{tables.SCORE}; mean over seeds [95% t interval]"):
         console.print(line, markup=False, highlight=False)
     shown = texts(report.summary, SHOWN[MARK])

@@ -85,7 +85,7 @@ def mean_and_ends(scores: np.ndarray, prefix: str = "", suffix: str = "") -> Row
 def _ordered(table: pd.DataFrame, *keys: pd.Series) -> pd.DataFrame:
     """Sort by setting, then references last, then by some keys; unknown values last."""
     columns = [table[name] for name in SETTING if name in table] + [table["method"].isin(load.REFERENCES), *keys]
-    order = pd.concat(columns, axis=1, ignore_index=True).pipe(lambda told: told.sort_values(list(told), kind="stable"))
+    order = pd.concat(columns, axis=1, ignore_index=True).pipe(lambda frame: frame.sort_values(list(frame), kind="stable"))
     return table.loc[order.index].reset_index(drop=True)
 
 
@@ -261,7 +261,7 @@ def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:
 
     `curves` are IDENTITY of each finished pretraining, and its losses by step.
     """
-    rows = [named | {"step": step, "action_loss": loss} for named, told in curves for step, loss in told]
+    rows = [named | {"step": step, "action_loss": loss} for named, curve in curves for step, loss in curve]
     parts = [pd.DataFrame(columns=[*CONDITION, "step", "action_loss", "seeds"])]
     for condition, part in pd.DataFrame(rows, columns=[*IDENTITY, "step", "action_loss"]).groupby(list(CONDITION)):
         wide = part.pivot_table("action_loss", "step", "seed").dropna()

@@ -104,8 +104,8 @@ def print_theory(study: Study) -> None:
         table.add_column()
         table.add_row("   printed", Text(rows[0]["printed"]))
         for row in rows:
-            told = f"{row['quantity']}: printed {row['claimed']}, computed {row['computed']}"
-            table.add_row(f"   {row['world']}", Text(told))
+            text = f"{row['quantity']}: printed {row['claimed']}, computed {row['computed']}"
+            table.add_row(f"   {row['world']}", Text(text))
         console.print(table)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from vd4rl_pomdp.runs.metrics import Metrics
 
 VALUE = "q"  # name under which algorithms log the critic's mean value over a batch
-TOLD = {"value", "moved", "data"}
+KEYS = {"value", "moved", "data"}
 """Keys of critic.json for an algorithm with a critic; for others it is empty."""
 CONVERGED = 0.02
 """A critic has converged if its value moved by less than this fraction over the last fifth of the updates."""

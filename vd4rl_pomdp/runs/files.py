@@ -53,9 +53,9 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
         writer.writerows(rows)
 
 
-def content_hash(told: Any) -> str:
+def content_hash(value: Any) -> str:
     """Hash of anything JSON-serialisable, 24 hex characters."""
-    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
+    return hashlib.blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
 def sha256(path: Path) -> str:

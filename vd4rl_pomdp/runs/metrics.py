@@ -212,12 +212,12 @@ class Wandb:
 
 def wandb_names(run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
     """wandb's `name`, `tags` and `group` of a run; seeds of one experiment share the group."""
-    told = [str(value) for name, value in labels.items() if name != "seed" and value != ""]
+    words = [str(value) for name, value in labels.items() if name != "seed" and value != ""]
     mark = recipe({"stage": run.stage, "config": run.config}, card, seeds=False)[:6]
-    title = " ".join([run.stage, *told])
+    title = " ".join([run.stage, *words])
     group = f"{title[: LONGEST['group'] - 7]} {mark}"
     seed = f" seed {run.config['seed']}"
-    tags = [tag[: LONGEST["tags"]] for tag in dict.fromkeys([run.stage, *told])]
+    tags = [tag[: LONGEST["tags"]] for tag in dict.fromkeys([run.stage, *words])]
     return {"group": group, "name": title[: LONGEST["name"] - len(seed)] + seed, "tags": tags}
 
 

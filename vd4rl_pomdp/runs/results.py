@@ -25,7 +25,7 @@ from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import damaged, fits, parse_json, read_bytes
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
-from vd4rl_pomdp.runs.critic import TOLD, VALUE
+from vd4rl_pomdp.runs.critic import KEYS, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, EVALUATION_SEED, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import (
     Row,
@@ -78,15 +78,15 @@ class Result:
     @property
     def parts(self) -> list[dict[str, Any]]:
         """Hardware and `git_commit` of the run, and of each later part that was resumed elsewhere."""
-        told = self.files.get("machine", {})
-        return [told | {"git_commit": self.record.get("git_commit")}, *told.get(CONTINUED, [])]
+        first = self.files.get("machine", {})
+        return [first | {"git_commit": self.record.get("git_commit")}, *first.get(CONTINUED, [])]
 
     @property
     def machine(self) -> str:
         """Its GPU, or its processor and cores; "A then B" if it moved; empty if unknown."""
         known = [(part.get("gpu"), part.get("processor"), part.get("cores")) for part in self.parts]
-        told = [gpu or (f"{name}, {cores} cores" if name and cores else name) for gpu, name, cores in known]
-        return " then ".join(dict.fromkeys(str(one) for one in told if one))
+        names = [gpu or (f"{name}, {cores} cores" if name and cores else name) for gpu, name, cores in known]
+        return " then ".join(dict.fromkeys(str(one) for one in names if one))
 
     @property
     def commit(self) -> str:
@@ -101,8 +101,8 @@ class Result:
     @property
     def origin(self) -> dict[str, Any]:
         """Its encoder's record of its code, in earlier rows a separate part; empty without an encoder."""
-        told = self.files.get("encoder", {})
-        return told.get("origin", told)
+        record = self.files.get("encoder", {})
+        return record.get("origin", record)
 
     @property
     def card(self) -> dict[str, Any]:
@@ -225,7 +225,7 @@ def _check(run: Result) -> None:
     if "seed" not in config or not isinstance(stage, str):
         raise TypeError(f"its record holds no settings, or its stage is {stage!r}")
     critic = run.files.get("critic", {})
-    if critic.keys() - TOLD or any(not (fits(v, float | None) and math.isfinite(v or 0)) for v in critic.values()):
+    if critic.keys() - KEYS or any(not (fits(v, float | None) and math.isfinite(v or 0)) for v in critic.values()):
         raise TypeError(f"its {CRITIC_FILE} is {critic}")
 
 
@@ -251,17 +251,17 @@ def read_results(folder: Path | str) -> list[Result]:
     runs: dict[str, Result] = {}
     for number, line in enumerate(lines, 1):
         with damaged(f"{path}: line {number}", *DAMAGED):
-            told = parse_json(line)
-            name, count = told["id"], int(told["episodes"])
+            record = parse_json(line)
+            name, count = record["id"], int(record["episodes"])
             rows = by_run.get(name, [])
             if name in runs:
                 raise UserError(f"{path}: names a run twice; remove one of the two lines")
             if len(rows) < count:
                 raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; take another copy")
-            files = {key: told[key] for key in FILES if key in told}
-            losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
+            files = {key: record[key] for key in FILES if key in record}
+            losses = [(int(step), float(loss)) for step, loss in record.get("losses", [])]
             # ignore rows that a later, interrupted write added
-            runs[name] = Result(name, folder, files, int(told["step"]), losses, rows[:count])
+            runs[name] = Result(name, folder, files, int(record["step"]), losses, rows[:count])
             _check(runs[name])
     return list(runs.values())
 
@@ -275,8 +275,8 @@ def write_results(out: Path, runs: Iterable[Result]) -> None:
         with fresh.open("w", encoding="utf-8") as file:
             for run in runs:
                 files = {name: run.files[name] for name in FILES if name in run.files}
-                told = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
-                file.write(json.dumps(told | ({"losses": run.losses} if run.losses else {})) + "\n")
+                record = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
+                file.write(json.dumps(record | ({"losses": run.losses} if run.losses else {})) + "\n")
         # Inside the block: if the disk is full, both files stay unchanged.
         write_csv(out / EPISODES_FILE, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
 
@@ -371,8 +371,8 @@ def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[s
     """
     found: dict[str, Row] = {}
     for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
-        told = {} if but is not None and file.parent.resolve() == but.resolve() else read_json(file)
-        for name, one in told.items():
+        here = {} if but is not None and file.parent.resolve() == but.resolve() else read_json(file)
+        for name, one in here.items():
             if not (isinstance(one, dict) and one.keys() >= _HOLDS):
                 raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
             found[name] = max(found.get(name, one), one, key=_rank)
@@ -423,8 +423,8 @@ def _contradictions(run: Result) -> Iterator[str]:
         trained = {name: value for name, value in card.items() if name != "seed"} | card.get("corruption", {})
         known = {name: value for name, value in ((trained if run.card else {}) | config).items() if name in LABELS}
         for name, value in known.items():
-            told = [(run.labels, "its labels have"), *((row, "an episode has") for row in run.rows)]
-            wrong = [(row[name], whose) for row, whose in told if value is not None and row[name] != value]
+            labelled = [(run.labels, "its labels have"), *((row, "an episode has") for row in run.rows)]
+            wrong = [(row[name], whose) for row, whose in labelled if value is not None and row[name] != value]
             if wrong:
                 yield f"{wrong[0][1]} the {name} {wrong[0][0]}, its record {value} ({len(wrong)} such)"
         # not steps: an encoder may be an intermediate checkpoint of a longer training

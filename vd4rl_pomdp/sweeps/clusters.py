@@ -231,8 +231,8 @@ class RayCluster:
             try:
                 self._ray.get(task)
             except self._ray.exceptions.RayError as error:
-                told = first_line(getattr(error, "cause", None) or error)
-                print(f"warning: a task ended ({told})", file=sys.stderr, flush=True)
+                reason = first_line(getattr(error, "cause", None) or error)
+                print(f"warning: a task ended ({reason})", file=sys.stderr, flush=True)
         return len(self._running)
 
     def submit(self, task: ClusterTask, number: int) -> None:

@@ -145,9 +145,9 @@ class SweepFolder:
 def read_plan(path: Path) -> Plan:
     """Read a plan as written; UserError if it is damaged."""
     with damaged(path, "is damaged", "remove it and start `sweep run` again"):
-        told = parse_json(read_bytes(path))
-        jobs = [Job(**job | {"folder": Path(job["folder"])}) for job in told["jobs"]]
-        return Plan(jobs, Path(told["made_in"]), Path(told["out"]), list(told["program"]))
+        plan = parse_json(read_bytes(path))
+        jobs = [Job(**job | {"folder": Path(job["folder"])}) for job in plan["jobs"]]
+        return Plan(jobs, Path(plan["made_in"]), Path(plan["out"]), list(plan["program"]))
 
 
 def jobs_of(plans: Iterable[Plan]) -> list[Job]:

@@ -27,7 +27,7 @@ from vd4rl_pomdp.runs.files import content_hash, files_below, groups, read_json
 from vd4rl_pomdp.runs.results import Result, read_records, read_results
 from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps.grid import GridCell
-from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told
+from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, stage_settings
 
 DATA = "data"  # default folder of the datasets, below the sweep's folder
 _DOWNLOADED = "84px"  # subfolder that holds the shards of a downloaded dataset
@@ -131,10 +131,10 @@ def runs_kept(folders: Iterable[Path]) -> list[Result]:
 
 def with_collections(runs: Iterable[Result]) -> list[Result]:
     """Fill in missing collection settings of runs from other runs on the same content. Keeps the order."""
-    told = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
+    collections = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
     return [
-        replace(run, files=run.files | {"config": run.record | {"collection": told[run.data]}})
-        if run.data in told and not run.record.get("collection")
+        replace(run, files=run.files | {"config": run.record | {"collection": collections[run.data]}})
+        if run.data in collections and not run.record.get("collection")
         else run
         for run in runs
     ]
@@ -177,7 +177,7 @@ def training_job(
 ) -> Job:
     """The job of a cell's training in `out`, after the jobs `before` it; `values` are its settings and theirs."""
     places = {"data": data} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
-    words = [*COMMANDS[section], *words_of(told(cell, section) | places | {"out": out})]
+    words = [*COMMANDS[section], *words_of(stage_settings(cell, section) | places | {"out": out})]
     needs, settings = [job.name for job in before], _words_by_name(values)
     return Job(name, section, out, words, needs, settings=settings, recipe=recipe_of(cell, section))
 
@@ -227,7 +227,7 @@ class _Planner:
             data.check()
             self._of_other_code.update(of_other_code(read_plan(data.folder), data.wanted))
         data = self._sets.setdefault(data.name, data)
-        words = [*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder)]
+        words = [*COMMANDS[data.section], *words_of(stage_settings(cell, data.section)), "--out", str(data.folder)]
         settings = _words_by_name(data.wanted)
         job = Job(f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=settings)
         before = [self._jobs.setdefault((data.section, "", data.name), job)]

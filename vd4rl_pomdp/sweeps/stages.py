@@ -45,7 +45,7 @@ _TAKES = {"collect": (), "navigation_collect": ("preset",)}
 """Shared settings that a stage accepts, if not all of them."""
 
 
-def told(cell: GridCell, section: str) -> Values:
+def stage_settings(cell: GridCell, section: str) -> Values:
     """A cell's settings for a stage, in command-line order."""
     takes = _TAKES.get(section, tuple(cell.shared))
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
@@ -70,7 +70,7 @@ def check_cells(cells: Sequence[GridCell], grid: str) -> None:
 
 def config_of(cell: GridCell, section: str) -> Any:
     """A stage's config, parsed as its command line would be, with placeholder folders."""
-    settings = told(cell, section)
+    settings = stage_settings(cell, section)
     later = {"seed": settings.pop("seed", 0)}
     if section == "collect" and settings.get("quality", "expert") not in SET_QUALITIES:
         later |= {"quality": str(settings["quality"])}  # a user's own dataset, which no command collects
