@@ -54,7 +54,7 @@ class FinetuneConfig(StageConfig):
     precision: Precision = "fp32"
     """Encoder precision: fp32, tf32 (GPU only) or bf16 autocast."""
     update_precision: Precision = "fp32"
-    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast but for the last layers."""
+    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast except in last layers."""
     eval_every: int = 50_000
     """Updates between evaluations; the final update is always evaluated."""
     eval_episodes: int = 10
@@ -144,7 +144,7 @@ def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, task: st
     try:
         decisions = TASKS.named(task).decisions if config.eval_episodes else 0
     except UserError as error:
-        raise UserError(f"{error}; `--eval-episodes 0` trains a policy without playing it") from error
+        raise UserError(f"{error}; `--eval-episodes 0` trains a policy without evaluating it") from error
     if config.eval_length == FinetuneConfig.eval_length:
         config = replace(config, eval_length=max(config.eval_length, decisions))
     if algorithm:

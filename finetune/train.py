@@ -161,7 +161,7 @@ def train(trainers: Sequence[FinetuneTrainer]) -> None:
                 diverged.append(error)
                 left.remove(trainer)
                 if left:
-                    print(f"warning: training diverged, {error}; the other runs go on", file=sys.stderr)
+                    print(f"warning: training diverged, {error}; the other runs continue", file=sys.stderr)
 
     with ExitStack() as opened:
         opened.enter_context(kept_workers())

@@ -52,8 +52,8 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (much cheaper), nature_half (nature at half resolution), small, mixer,
-    pretrained (a frozen image model), or state, which reads the simulator state instead of pixels."""
+    """Frame encoder: drq, nature (much cheaper), nature_half (nature at half resolution), small or mixer.
+    Or pretrained (a frozen image model), or state, which reads the simulator state instead of pixels."""
     precision: Precision = "fp32"
     """Precision of matrix products: fp32, tf32 (on a GPU), or bf16 autocast."""
     device: str = "auto"
@@ -133,7 +133,7 @@ class PretrainConfig(TrainingConfig):
         method = METHODS.named(self.method)
         refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
         if self.batch_size < method.least_batch:
-            why = f"{self.method} tells windows apart: give it {method.least_batch}"
+            why = f"{self.method} contrasts windows: give it {method.least_batch}"
             raise UserError(f"--batch-size is {self.batch_size}; {why}")
         if self.frame_encoder == STATE and not (isinstance(self.options, ActionOptions) or self.method == "random"):
             raise UserError(f"--frame-encoder state is for random and methods that predict actions, not {self.method}")

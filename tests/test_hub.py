@@ -149,7 +149,7 @@ def test_revisions_are_branches_and_commits(hub, encoder, tmp_path):
     for revision, seed in (("main", 0), ("seed1", 1), (first, 0)):
         pull(ENCODER, tmp_path / revision, revision)
         assert load_encoder(tmp_path / revision)[1].seed == seed
-    with pytest.raises(UserError, match=r"lab/encoder: the Hub refuses or does not answer .*check the name, --rev"):
+    with pytest.raises(UserError, match=r"lab/encoder: the Hub refused or did not answer .*check the name, --rev"):
         pull(ENCODER, tmp_path / "new", "seed2")
     assert not (tmp_path / "new").exists()
 
@@ -252,7 +252,7 @@ def test_what_fails_in_a_push_is_one_sentence_and_leaves_no_half(hub, encoder, m
     save_encoder(encoder, make("gru", True), replace(CARD, seed=1))
     before = hub.files(WHERE[ENCODER])
     hub.status = {path: status}
-    with pytest.raises(UserError, match=f"lab/encoder: the Hub refuses or does not answer .*{status}") as told:
+    with pytest.raises(UserError, match=f"lab/encoder: the Hub refused or did not answer .*{status}") as told:
         push(encoder, ENCODER)
     assert "\n" not in str(told.value)
     assert hub.files(WHERE[ENCODER]) == before
@@ -263,7 +263,7 @@ def test_where_nobody_is_nothing_is_left(encoder, tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
     monkeypatch.setenv("NO_PROXY", "*")
     for act in (lambda: pull(ENCODER, tmp_path / "new"), lambda: push(encoder, ENCODER)):
-        with pytest.raises(UserError, match=r"lab/encoder: the Hub refuses or does not answer .*and the network"):
+        with pytest.raises(UserError, match=r"lab/encoder: the Hub refused or did not answer .*and the network"):
             act()
     assert lists(tmp_path) == ["run"]
 
@@ -272,7 +272,7 @@ def test_the_commands_of_the_program(hub, encoder, tmp_path, capsys):
     main(["hub", "push", str(encoder), "lab/encoder", "--private", "--revision", "v1"])
     assert "/models/lab/encoder/commit/" in capsys.readouterr().out
     new = str(tmp_path / "new")
-    for told in ("fetched and checked", "is there already, and right"):
+    for told in ("downloaded and verified", "already present and verified"):
         main(["hub", "pull", "lab/encoder", new, "--revision", "v1"])
         assert tuple(capsys.readouterr()) == (f"{new}: {told}\n", "")
     with pytest.raises(SystemExit) as ended:

@@ -36,9 +36,7 @@ class Config:
     """Settings of the table."""
 
     out: Path = Path("results/datasets")
-    """Folder of returns.csv (one row per episode), costs.csv (one per task), actors.json (hashes of each dataset's
-    actors) and the table, sets.csv.
-    """
+    """Folder of returns.csv (one row per episode), costs.csv (one per task), actors.json and the table, sets.csv."""
     tasks: tuple[str, ...] = tuple(TASKS)
     qualities: tuple[str, ...] = tuple(SET_QUALITIES)
     """Qualities; one whose actor is not shipped is left out."""

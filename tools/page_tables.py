@@ -65,7 +65,7 @@ def with_tables(text: str, tables: Tables, page: str) -> str:
     for name, table in tables.items():
         mark = MARK.format(name)
         if (count := lines.count(mark)) != 1:
-            raise UserError(f"{page}: one line `{mark}` is wanted, above where that table belongs; {count} found")
+            raise UserError(f"{page}: expected one line `{mark}` above that table, found {count}")
         start = end = lines.index(mark) + 1
         while end < len(lines) and lines[end].startswith("|"):
             end += 1

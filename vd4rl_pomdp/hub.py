@@ -63,7 +63,7 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
     kind = AGENT if (kind, held) == (ENCODER, AGENT) else kind
     if held != kind:
         raise UserError(
-            f"{folder}: holds {held or 'nothing of the kind'}, not {kind}, which {repository} is the name for; name "
+            f"{folder}: contains {held or 'nothing to push'}, but {repository} is a name for {kind}; pass "
             "RUN/encoder or an exported agent and OWNER/NAME, or a folder of shards and datasets/OWNER/NAME"
         )
     files = _checked(folder, kind)
@@ -155,10 +155,10 @@ def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
     except UserError:
         raise
     except OfflineModeIsEnabled as error:
-        raise UserError("HF_HUB_OFFLINE is set, so that nothing is sent or fetched; unset it") from error
+        raise UserError("HF_HUB_OFFLINE is set, so nothing can be uploaded or downloaded; unset it") from error
     except (HfHubHTTPError, HTTPError, LocalEntryNotFoundError, RuntimeError, ValueError) as error:
         raise UserError(
-            f"{repository}: the Hub refuses or does not answer ({in_one_line(error)}); check the name, --revision, "
+            f"{repository}: the Hub refused or did not answer ({in_one_line(error)}); check the name, --revision, "
             "HF_TOKEN or `hf auth login`, and the network"
         ) from error
 

@@ -38,7 +38,7 @@ MARGIN = 1e-6
 class BC(Algorithm):
     """See the module."""
 
-    summary = "behaviour cloning, which uses no reward"
+    summary = "behaviour cloning, without rewards"
 
     def __init__(
         self, policy: Policy, options: Options, learning_rate: float, updates: int, draws: RandomStream

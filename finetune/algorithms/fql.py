@@ -102,7 +102,7 @@ class FQL(Algorithm):
     """See the module."""
 
     options: type[Options] = FQLOptions
-    summary = "flow Q-learning: a flow clones the data, a one-step policy distilled from it seeks value"
+    summary = "flow Q-learning: a flow clones the data; a one-step policy distilled from it maximises value"
     tau = 0.005
 
     def __init__(

@@ -73,7 +73,7 @@ class IQL(Algorithm):
     """See the module."""
 
     options: type[Options] = IQLOptions
-    summary = "implicit Q-learning: values of the actions taken, and a policy that clones the better ones"
+    summary = "implicit Q-learning: expectile values of the data's actions, advantage-weighted cloning"
     tau = 0.005
 
     def __init__(

@@ -66,7 +66,7 @@ class ReBRAC(TD3BC):
     """See the module."""
 
     options: type[Options] = ReBRACOptions
-    summary = "TD3+BC with a second penalty in the target, and LayerNorm in deeper critics"
+    summary = "TD3+BC with a behaviour penalty also in the target, and deeper critics with LayerNorm"
 
     def __init__(
         self, policy: Policy, options: ReBRACOptions, learning_rate: float, updates: int, draws: RandomStream

@@ -61,7 +61,7 @@ class Method:
 
 _OWN = {
     "no_history": Method(
-        AllHistory, options=InverseOptions, summary="inverse model on the observations t and t+k alone"
+        AllHistory, options=InverseOptions, summary="inverse model on only the observations t and t+k"
     ),
     "ah": Method(AllHistory, "gru", options=InverseOptions, summary="inverse model on the whole past at t and at t+k"),
     "ah+a": Method(
@@ -69,7 +69,7 @@ _OWN = {
         "gru",
         use_actions=True,
         options=InverseOptions,
-        summary="ah with past actions, the predicted one among them",
+        summary="ah with past actions, including the predicted one",
     ),
     "fj": Method(
         ForwardJump, "gru", past=8, options=InverseOptions, summary="inverse model on t, t+k and the m rows before each"
@@ -151,7 +151,7 @@ _OWN = {
         regresses_state=True,
         histories=True,
         options=SupervisedOptions,
-        summary="supervised on the first observation, later actions and the time alone",
+        summary="supervised on only the first observation, later actions and time",
     ),
     "bc": Method(Untrained, trained=False, end_to_end="bc", summary="behaviour cloning from pixels, end to end"),
     "drq_bc": Method(Untrained, trained=False, end_to_end="drqv2_bc", summary="DrQ-v2+BC from pixels, end to end"),

@@ -47,8 +47,8 @@ class MaskedOptions(InverseOptions):
     """Rows after t+k that the future encoder reads; None: all up to the window's end."""
 
     future_frames: Literal["all", "newest"] = "all"
-    """Frames that the future shows: all, up to two of which belong to masked steps,
-    or newest, which blanks the frames before t+k."""
+    """Frames that the future shows: all, of which up to two belong to masked steps.
+    Or newest, which blanks the frames before t+k."""
 
     limits: ClassVar[Limits] = {"n": 0}
 

@@ -66,7 +66,9 @@ def test_every_command_has_help_and_its_group_a_list(name, capsys):
     with pytest.raises(SystemExit) as end:
         main([*name.split(), "--help"])
     assert end.value.code in (0, None)
-    assert name in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert name in shown
+    assert "Args:" not in shown, "each flag shows its own text"
     for words in ([], name.split()[: 0 if name.startswith("report") else -1]):
         main(words)
         assert COMMANDS[name][1] in capsys.readouterr().out

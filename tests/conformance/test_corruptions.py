@@ -134,7 +134,7 @@ class Wavering(Alternating):
 
 MUTANTS = [
     (Nothing, something_changes, "none differs"),
-    (Batchwise, equal_keys_give_equal_masks, "a stack looks different in a batch than alone"),
+    (Batchwise, equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
     (Batchwise, the_environment_shows_what_the_data_show, "a row looks different in the environment"),
     (Drawing, draws_depend_on_keys_alone, "equal keys gave different pixels"),
     (Counting, emission_never_changes_a_row, "a row looked different the second time"),

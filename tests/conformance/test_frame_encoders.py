@@ -89,7 +89,7 @@ MUTANTS = [
         r"features of image 1 have gradients to \[True, True, True\]",
     ),
     (Lost, gradients_reach_all_parameters, "none reaches convolutions.1.unused.bias, convolutions.1.unused.weight"),
-    (nn.Dropout, a_seed_decides_everything, "features differ from call to call, training True"),
+    (nn.Dropout, a_seed_decides_everything, "features differ between calls, training True"),
     (Hidden, a_folder_gives_back_the_encoder, "its features differ"),
 ]
 

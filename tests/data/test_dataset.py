@@ -270,5 +270,5 @@ def test_a_link_tells_a_set_as_the_folder_that_it_names_would(tmp_path):
     (tmp_path / "walker_walk" / "expert").symlink_to(held)
     linked = open_dataset(tmp_path / "walker_walk" / "expert", tmp_path / "cache")
     assert (linked.task, linked.quality) == ("walker_walk", "expert")
-    with pytest.raises(UserError, match=r"medium: has physics but names no task; put it in a folder named"):
+    with pytest.raises(UserError, match=r"medium: has physics but no task name; put it in a folder named"):
         open_dataset(held, tmp_path / "cache").require_states()

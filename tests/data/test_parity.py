@@ -101,5 +101,5 @@ def test_the_background_of_a_set_decides_whatever_the_canaries_say(monkeypatch, 
 
 def test_a_set_of_an_unknown_task_is_refused(monkeypatch):
     monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(None, np.zeros((2, 3, 84, 84), np.uint8)))
-    with pytest.raises(UserError, match="cannot tell the task"):
+    with pytest.raises(UserError, match="cannot determine the task"):
         parity._compare_background("somewhere")

@@ -204,7 +204,7 @@ def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_pat
         patch.setattr(FinetuneTrainer, "build", broken)
         with pytest.raises(FloatingPointError, match=rf"{tmp_path / '1'}: critic_loss is .* in the row of step 3"):
             finetune_all(configs)
-    assert "the other runs go on" in capsys.readouterr().err
+    assert "the other runs continue" in capsys.readouterr().err
     assert read_json(tmp_path / "1" / "diverged.json")["step"] == 3
     assert not (tmp_path / "1" / "timing.json").exists()
     finetune(smoke_finetune(encoder, data, tmp_path / "alone", **BRIEF, seed=2))

@@ -121,7 +121,7 @@ def test_features_never_come_from_weights_that_the_file_lacks(tmp_path: Path):
     del lacking.layernorm.bias
     lacking.save_pretrained(tmp_path / "lacking")
     assert model(tmp_path / "lacking") is not None, "transformers loads it"
-    with pytest.raises(UserError, match=r"its file lacks 1 weights, such as layernorm\.bias: fetch it again"):
+    with pytest.raises(UserError, match=r"its file lacks 1 weights, such as layernorm\.bias: download it again"):
         make("pretrained", model=str(tmp_path / "lacking"), model_size=SIZE)
 
 
@@ -144,7 +144,7 @@ def test_a_model_with_text_gives_its_vision_half_under_its_own_statistics(tmp_pa
 def test_random_features_and_other_sizes_are_refused(tmp_path: Path):
     transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
     transformers.ViTMAEModel(transformers.ViTMAEConfig(**SHAPE)).save_pretrained(tmp_path / "mae")
-    with pytest.raises(UserError, match="its features of one image differ from call to call"):
+    with pytest.raises(UserError, match="its features of one image differ between calls"):
         make("pretrained", model=str(tmp_path / "mae"), model_size=SIZE)
     transformers.ViTModel(transformers.ViTConfig(**SHAPE)).save_pretrained(tmp_path / "vit")
     with pytest.raises(UserError, match=r"cannot encode images of 56x56 pixels \(Input image size .* --model-size"):

@@ -60,7 +60,7 @@ def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, 
     [
         ({"method": "mikado"}, r"unknown method 'mikado'.*mik\+a"),
         ({"window": 21}, "episode 0 .*20 rows"),
-        ({"method": "curl", "batch_size": 1}, "--batch-size is 1; curl tells windows apart: give it 2"),
+        ({"method": "curl", "batch_size": 1}, "--batch-size is 1; curl contrasts windows: give it 2"),
         ({"patch_size": 85}, "exceeds the image"),
         ({"zeroed_frames": 4}, "cannot zero 4 of 3"),
         ({"device": "meta"}, "unknown device 'meta'"),

@@ -15,7 +15,7 @@ from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 800.0
-LEAD, OVER_GRU = "mik+a less acro", "mik+a less acro with a GRU"
+LEAD, OVER_GRU = "mik+a minus acro", "mik+a minus acro with a GRU"
 
 
 def write(folder: Path, steps: int, scores: dict[str, tuple[float, ...]], **policy: Any) -> None:
@@ -82,7 +82,7 @@ def test_a_report_of_one_budget_has_no_lead(tmp_path):
 def test_the_page_shows_leads_and_what_is_missing(runs, tmp_path, figure_files):
     report = write_report([runs], tmp_path / "out")
     page = report.page.read_text()
-    assert "<h2>Lead against the budget of pretraining</h2>" in page
+    assert "<h2>Lead by pretraining budget</h2>" in page
     assert "3,000 x 256" in page
     table = pd.read_csv(tmp_path / "out" / "lead.csv")
     assert table["difference"].isna().tolist() == [False, False, False, True]

@@ -68,7 +68,7 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     main(words)
     shown = capsys.readouterr()
     assert f"patch: {told['verdict']} ({told['why']})" in shown.out
-    assert f"the certificate is in {out} alone" in shown.err
+    assert f"the certificate is only in {out}" in shown.err
     (states / "certificates.json").rmdir()
 
     before, carried[:] = contents(out / MEMORY), []

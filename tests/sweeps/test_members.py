@@ -163,7 +163,7 @@ def test_a_report_is_about_the_cells_that_are_asked_for(grid, runs, tmp_path, ca
     assert [run.labels["method"] for run in read_results(tmp_path / "report")] == ["acro", "acro"]
     capsys.readouterr()
     for flags, told in (
-        (["--only", "method=acro"], "--only and --change select and change the cells of a grid: name it with --grid"),
+        (["--only", "method=acro"], "--only and --change apply to the cells of a grid: add --grid"),
         (["--grid", "navigation"], "navigation: its cells are mazes; `vd4rl-pomdp navigation report` reports them"),
     ):
         with pytest.raises(SystemExit) as end:

@@ -87,7 +87,7 @@ def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
     card = read_json(folder / CARD)
     about = read_json(folder / FILES[0]).get("pretrain", {}) if card.get("sha256") == checksums(folder) else {}
     if not about or any(card.get(name) != about[name] for name in ("task", "method", "corruption")):
-        raise UserError(f"{folder}: its files do not match {CARD}; take another copy")
+        raise UserError(f"{folder}: its files do not match {CARD}; use another copy")
     return folder, card
 
 

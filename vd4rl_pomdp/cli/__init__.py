@@ -133,6 +133,6 @@ def _show_commands(words: list[str]) -> None:
     if not listed or (group and len(words) > 1 and not words[1].startswith("-")):
         choices = [n.split()[-1] for n in listed] or dict.fromkeys(n.split()[0] for n in COMMANDS)
         raise UserError(f"unknown command '{' '.join([PROGRAM, *words[:2]])}': choose one of {', '.join(choices)}")
-    print(f"usage: {' '.join([PROGRAM, *group])} COMMAND [--flags]   (COMMAND --help says more)\n")
+    print(f"usage: {' '.join([PROGRAM, *group])} COMMAND [--flags]   (COMMAND --help for details)\n")
     for name, summary in listed.items():
         print(f"  {name:<{max(map(len, listed))}}  {summary}")

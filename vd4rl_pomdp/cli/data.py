@@ -103,7 +103,7 @@ def export_set(
 
 @command
 def card(set: tyro.conf.Positional[Path]) -> None:
-    """Write a dataset's data card, card.md and card.png, into its folder; `data collect` does so itself.
+    """Write a dataset's data card, card.md and card.png, into its folder. `data collect` also writes it.
 
     Args:
         set: Dataset folder.
@@ -139,7 +139,7 @@ def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) ->
     """Compare rendered reference frames with stored ones, and a dataset's background with the environment's.
 
     Args:
-        set: A dataset, whose background decides; without one, the reference frames do.
+        set: Compare this dataset's background; without it, the reference frames are compared.
         json: Print one JSON object.
     """
     from vd4rl_pomdp.data.parity import check_parity  # loads OpenGL
@@ -150,6 +150,6 @@ def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) ->
         raise UserError(f"the environment's background differs from that of {set}: see `background` above")
     if not result["equal"]:
         raise UserError(
-            f"{result['render']['gl_renderer']} renders other pixels than the golden frames' software renderer: name "
-            "a dataset to compare with that instead"
+            f"{result['render']['gl_renderer']} renders different pixels from the reference frames' software "
+            "renderer: pass a dataset to compare with its background instead"
         )

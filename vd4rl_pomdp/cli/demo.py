@@ -76,14 +76,14 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
     words = ["report", str(out / "runs"), "--out", str(out / "report")]
     for line in (*(job.words for job in planned if not job.finished), words):  # to repeat them by hand
         print(f"$ vd4rl-pomdp {shlex.join(line)}", file=sys.stderr)
-    print(f"Where this stands: vd4rl-pomdp sweep status {out}; what it prints: {folder.path / 'logs'}", file=sys.stderr)
+    print(f"Progress: vd4rl-pomdp sweep status {out}; output: {folder.path / 'logs'}", file=sys.stderr)
     carry_out([folder.keep_plan("demo", planned)], folder, "local", options)
     report(words[1:], "vd4rl-pomdp report")
     print("\n".join(conclusion(planned)))
     if "navigation" in GRIDS:
         print("\n".join(show_navigation(planned, out / FILM)))
     else:
-        print("The mazes are left out: they need the extra `navigation`.")
+        print("The mazes are skipped: they need the extra `navigation`.")
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
 
 

@@ -24,15 +24,16 @@ def push(
     revision: str = "main",
     license: str = "mit",
 ) -> None:
-    """Upload an encoder, an agent or a dataset to the Hugging Face Hub in one commit; huggingface_hub's endpoint and
-    token.
+    """Upload an encoder, an agent or a dataset to the Hugging Face Hub in one commit.
 
-        Args:
-            folder: RUN/encoder, an agent from `agents export`, or a dataset folder.
-            repository: OWNER/NAME for an encoder or agent, datasets/OWNER/NAME for a dataset; created if missing.
-            private: Make it private.
-            revision: Branch to write to; created if missing.
-            license: Licence for its card, as the Hub spells it.
+    Endpoint and token are those of huggingface_hub.
+
+    Args:
+        folder: RUN/encoder, an agent from `agents export`, or a dataset folder.
+        repository: OWNER/NAME for an encoder or agent, datasets/OWNER/NAME for a dataset; created if missing.
+        private: Make it private.
+        revision: Branch to write to; created if missing.
+        license: Licence for its card, as the Hub spells it.
     """
     print(hub.push(folder, repository, private, revision, license))
 
@@ -47,7 +48,7 @@ def pull(repository: tyro.conf.Positional[str], folder: tyro.conf.Positional[Pat
         revision: Branch, tag or commit.
     """
     fetched = hub.pull(repository, folder, revision)
-    print(f"{folder}: {'fetched and checked' if fetched else 'is there already, and right'}")
+    print(f"{folder}: {'downloaded and verified' if fetched else 'already present and verified'}")
 
 
 @command

@@ -38,22 +38,22 @@ def report(
     only: tuple[str, ...] = (),
     change: tuple[str, ...] = (),
 ) -> None:
-    """Write an HTML report with tables and figures about fine-tuning runs; `report compare A B` compares two sets of
-    runs.
+    """Write an HTML report with tables and figures about fine-tuning runs.
 
-        Args:
-            runs: Run folders, results folders, or folders that contain some; output of `theory --out` adds its section.
-            out: Folder of the report.
-            grid: Report only the cells of this grid: a shipped one (`vd4rl-pomdp sweep list`), or a TOML or Python
-                file.
-            only: Report only grid cells with these values: method=mik+a,acro seed=0.
-            change: Overrides that the grid was run with: preset=cpu finetune.updates=20000.
+    `report compare A B` compares two sets of runs.
+
+    Args:
+        runs: Run folders, results folders, or folders that contain some; output of `theory --out` adds its section.
+        out: Folder of the report.
+        grid: Report only the cells of this grid: a shipped one (`vd4rl-pomdp sweep list`) or a TOML or Python file.
+        only: Report only grid cells with these values: method=mik+a,acro seed=0.
+        change: Overrides that the grid was run with: preset=cpu finetune.updates=20000.
     """
     choice = ALL
     if grid:
         choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
     elif only or change:
-        raise UserError("--only and --change select and change the cells of a grid: name it with --grid")
+        raise UserError("--only and --change apply to the cells of a grid: add --grid")
     written = write_report(_named(runs), out, choice)
     print_summary(written)
     for sentence in written.unlike:
@@ -119,7 +119,7 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
             same = "digits are the same only where these are"
             raise UserError(f"{replay}: replays to {', '.join(differ)}; {where}: {same}")
     if wrong:
-        raise UserError(f"{folder}: {len(wrong)} contradictions, see above; ask who made the rows")
+        raise UserError(f"{folder}: {len(wrong)} contradictions, see above; ask their author")
 
 
 @command

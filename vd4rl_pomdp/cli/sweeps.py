@@ -142,7 +142,7 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
         retry = f"sweep retry {shlex.quote(str(folder.out))}" + (f" --executor {kind}" if kind != "local" else "")
         same = "" if kind == "local" else ", given this command's flags,"
         failures = f"{len(found['failures'])} failed; `{program_name(plans[0].program)} {retry}`"
-        print(f"{left}, {failures}{same} takes those up again")
+        print(f"{left}, {failures}{same} retries them")
         sys.exit(1)
     print(f"all {len(jobs)} jobs are finished")
 
@@ -209,7 +209,7 @@ def join(
     options.check()
     folder = SweepFolder(out)
     finished = Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
-    print("all is finished" if finished else "there is nothing to take now; `sweep status` tells what is left")
+    print("all jobs are finished" if finished else "no job can start now; `sweep status` shows what is left")
 
 
 @command

@@ -79,10 +79,10 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
         raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
 
 
-def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
+def distinct_texts(value: float, limit: float, decimals: int) -> tuple[str, str]:
     """Format two numbers for a message with just enough decimals, at least `decimals`, to show which is larger."""
     texts = f"{value:,.{decimals}f}", f"{limit:,.{decimals}f}"
-    return told_apart(value, limit, decimals + 1) if value != limit and texts[0] == texts[1] else texts
+    return distinct_texts(value, limit, decimals + 1) if value != limit and texts[0] == texts[1] else texts
 
 
 OR_ONES_OWN = ", or run or import the file that registers it"

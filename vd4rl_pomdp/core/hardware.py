@@ -30,7 +30,7 @@ def pick_device(name: str) -> torch.device:
     if device.type not in ("cpu", "cuda"):
         raise UserError(f"unknown device {name!r}: use auto, cpu or cuda")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise UserError(f"device {name!r} was asked for, but no such GPU is visible: use --device cpu")
+        raise UserError(f"device {name!r} was requested, but no such GPU is visible: use --device cpu")
     return device
 
 

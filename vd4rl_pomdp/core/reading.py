@@ -94,7 +94,7 @@ def safetensors_metadata(content: bytes) -> dict[str, str]:
     header = parse_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
     metadata = header.get("__metadata__", {}) if isinstance(header, dict) else None
     if not isinstance(metadata, dict):
-        raise ValueError("its header is no JSON object")
+        raise ValueError("its header is not a JSON object")
     return metadata
 
 
@@ -110,5 +110,5 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     tensors = load(read_bytes(path))
     bad = next((n for n, v in tensors.items() if v.is_floating_point() and not torch.isfinite(v).all()), None)
     if bad is not None:
-        raise UserError(f"{path}: {bad!r} is not finite, so the file is damaged; take another copy or train again")
+        raise UserError(f"{path}: {bad!r} is not finite, so the file is damaged; use another copy or train again")
     return tensors

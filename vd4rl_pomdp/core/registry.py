@@ -115,8 +115,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
         if name in ("", ".", "..") or any(sign in name for sign in "/,= "):
             raise UserError(
-                f"{self.kind} {name!r}: folders and `--only` contain names, so they must be without slashes, commas, "
-                "blanks and equals signs: choose another"
+                f"{self.kind} {name!r}: names are part of paths and of `--only` and must not contain slashes, commas, "
+                "spaces or equals signs: choose another"
             )
         try:
             self._refuse(name, part)

@@ -137,7 +137,7 @@ class RandomStream:
         self._recorded = None
         if self._block is not None:
             if self._place < len(self._requests[self._turn]):
-                raise RuntimeError("a step asked for fewer random numbers than the steps before it")
+                raise RuntimeError("a step requested fewer random numbers than the recorded steps")
             self._counter.add_(1)
 
     def in_blocks(self) -> None:
@@ -191,7 +191,7 @@ class RandomStream:
     def _next(self, kind: str, shape: tuple[int, ...], high: tuple[int, ...] = ()) -> Tensor:
         if shape[: len(self._runs)] != self._runs:
             raise UserError(
-                f"a step of {self._runs[0]} stacked runs asked for random numbers of the shape {shape}: their first "
+                f"a step of {self._runs[0]} stacked runs requested random numbers of the shape {shape}: their first "
                 "dimension must be that of the batch, as in `self.draws.normal(*batch.action.shape)`"
             )
         draw = _Draw(kind, shape[len(self._runs) :], high)
@@ -204,7 +204,7 @@ class RandomStream:
             return drawn.to(self._device, non_blocking=self._device.type != "cpu")
         requests, place = self._requests[self._turn], self._place
         if place >= len(requests) or requests[place] != draw:
-            raise RuntimeError(f"a step asked for {draw}, other random numbers than the steps before it")
+            raise RuntimeError(f"a step requested {draw}, which the recorded steps did not")
         self._place += 1
         offset = self._offsets[self._turn][place]
         return self._row[:, offset : offset + draw.size].view(draw.dtype).view(shape)

@@ -108,7 +108,7 @@ class Task:
 
     @property
     def summary(self) -> str:
-        return f"each action {self.action_repeat} times, {self.decisions} decisions an episode"
+        return f"action repeat {self.action_repeat}, {self.decisions} decisions per episode"
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _refuse(name: str, task: Task) -> None:
         raise UserError(f"its score_divisor is {task.score_divisor!r}: it must be a positive number")
     noise = 0.0 if task.action_noise is None else task.action_noise
     if not (isinstance(noise, int | float) and 0 <= noise < math.inf):
-        raise UserError(f"its action_noise is {noise!r}: it must be a number that is not negative, or None")
+        raise UserError(f"its action_noise is {noise!r}: it must be 0 or a positive number, or None")
     if isinstance(task, DMCTask) and not isinstance(task.camera, int):
         raise UserError(f"its camera is {task.camera!r}: it must be the camera's number")
     if isinstance(task, GymnasiumTask):

@@ -56,7 +56,7 @@ class Patch(Options):
     patch_shared: bool = False
     """Put the patches at the same positions in all frames of a stack."""
 
-    summary: ClassVar[str] = "squares of every frame, at uniformly random places, take one value"
+    summary: ClassVar[str] = "squares at uniformly random places in every frame are set to one value"
     limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": (1, 1000), "patch_fill": (0, 255)}
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
@@ -124,7 +124,7 @@ class ZeroFrames(FrameDrop):
     """Never zero the newest frame: choose among the older ones only."""
 
     summary: ClassVar[str] = (
-        "frames of every stack, chosen uniformly, become 0; it must come last, as in patch+zero_frames"
+        "randomly chosen frames of every stack are set to 0; must come last, as in patch+zero_frames"
     )
     limits: ClassVar[Limits] = {"zeroed_frames": 1}
 
@@ -151,7 +151,7 @@ class Truncate(FrameDrop):
     kept: Literal["newest", "oldest"] = "newest"
     """The frame to keep: newest or oldest."""
 
-    summary: ClassVar[str] = "all frames of every stack but the newest, or the oldest, become 0; it must come last"
+    summary: ClassVar[str] = "all frames of every stack except the newest, or the oldest, are set to 0; must come last"
 
     def check(self) -> None:
         refuse_unknown("--kept", self.kept, ("newest", "oldest"))
@@ -174,7 +174,7 @@ def _is_stage(part: Any) -> bool:
 def _refuse_stage(name: str, kind: type[Options]) -> None:
     """Raise UserError for a stage with a reserved name or invalid options."""
     if name == "none" or "+" in name:
-        raise UserError("'none' and names with '+' mean no stage, or several: choose another name")
+        raise UserError("'none' and names with '+' are reserved: choose another name")
     refuse_options(kind)
 
 
@@ -238,7 +238,7 @@ class CorruptionConfig(Options):
         """Raise UserError if the stages do not match the name, or for invalid values."""
         if [type(stage) for stage in self.stages] != _kinds(self.corruption):
             raise UserError(
-                f"this config has other stages than {self.corruption!r} names, so it would do other things: make it by "
+                f"the stages of this config are not those of {self.corruption!r}: create it with "
                 f"CorruptionConfig.of({self.corruption!r}, ...)"
             )
         refuse_unknown("corruption mode", self.corruption_mode, get_args(Mode))

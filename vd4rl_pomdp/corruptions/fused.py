@@ -41,10 +41,10 @@ class Hiding(Protocol):
 def tells_pixels(stage: Any) -> bool:
     """Whether a stage is `Hiding`, and `hides` is not outdated by a subclass that overrides only `__call__`."""
     kinds = type(stage).__mro__
-    tells, does = (
+    hides, does = (
         next((i for i, kind in enumerate(kinds) if name in vars(kind)), len(kinds)) for name in ("hides", "__call__")
     )
-    return isinstance(stage, Hiding) and tells <= does
+    return isinstance(stage, Hiding) and hides <= does
 
 
 class StackDraws(NamedTuple):

@@ -49,7 +49,7 @@ HOW = {
 def write_card(path: Path) -> Path:
     """Write `card.md`, whose path is returned, and `card.png`; UserError for a damaged, incomplete or read-only set."""
     if path.is_file():
-        raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
+        raise UserError(f"{path}: is a single file; a card describes a whole dataset: name its folder")
     shards = shard_paths(path)
     read_frame_size(shards)
     parts = [read_rows(shard) for shard in shards]
@@ -138,7 +138,7 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
     if first and record.exists():
         provenance = read_json(record)
         if not all(isinstance(provenance.get(name, {}), dict) for name in ("render", "versions")):
-            raise UserError(f"{record}: is damaged; remove it, and the card goes without it")
+            raise UserError(f"{record}: is damaged; remove it to write the card without it")
         rendered = provenance.get("render", {})
         facts["rendered by"] = ", ".join(str(rendered[k]) for k in ("gl_vendor", "gl_renderer") if k in rendered)
         facts["canary frames"] = rendered.get("canary")

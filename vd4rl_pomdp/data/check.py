@@ -70,7 +70,7 @@ def _check_actions(dataset: Dataset) -> None:
             "follows it, and zeros in the first row"
         )
     if (most := np.abs(action).max()) > 1:
-        raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], as policies act")
+        raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], the range of policies")
 
 
 def _replayed(dataset: Dataset) -> tuple[float | None, str]:

@@ -52,8 +52,8 @@ class CollectConfig:
     task: str
     """walker_walk, cheetah_run, humanoid_walk, reacher_jump, point_mass_cue, or a task that you registered."""
     quality: Quality | NoisyQuality
-    """Behaviour policy: random actions, checkpoints on the way to the medium actor, the medium actor, half medium and
-    half expert, or the expert actor. The noisy qualities (not in V-D4RL) add the task's noise to every action."""
+    """Behaviour policy: random, checkpoints up to medium (medium_replay), the medium or expert actor, or half of each.
+    The noisy qualities (not in V-D4RL) add the task's noise to every action."""
     out: Path
     """Folder to write the dataset to."""
     episodes: int = 200
@@ -71,8 +71,8 @@ class CollectConfig:
     actor: Path | None = None
     """An actor file to use instead of the shipped one (for medium or expert)."""
     action_noise: float | None = None
-    """Standard deviation of Gaussian noise added to every action, both executed and stored; it becomes part of the
-    dataset's name. Default: none, or the task's noise for the noisy qualities."""
+    """Standard deviation of Gaussian noise added to every action, executed and stored. It becomes part of the name.
+    Default: none, or the task's noise for the noisy qualities."""
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ class Dataset:
                 f"{self.path}: stores no simulator states; `data collect` stores those of dm_control's tasks"
             )
         if self.task is None:
-            raise UserError(f"{self.path}: has physics but names no task; put it in a folder named after its task")
+            raise UserError(f"{self.path}: has physics but no task name; put it in a folder named after its task")
 
     def rows_of(self, episode: int | range) -> slice:
         """Rows of one episode, or of a range of consecutive episodes."""

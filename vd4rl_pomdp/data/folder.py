@@ -144,8 +144,8 @@ def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
     out = path.parents[2] if path.parts[-3:] == (task, quality, "84px") else "DIR"
     command = f"vd4rl-pomdp data download --task {task} --quality {quality} --out {out}"
     raise UserError(
-        f"{path}: is a part of V-D4RL's {task} {quality}, {len(shards)} of {len(published)} shards ({missing[0]} is "
-        f"missing); get the rest with `{command}`, or rename the shards to train on them alone"
+        f"{path}: contains {len(shards)} of {len(published)} shards of V-D4RL's {task} {quality} ({missing[0]} is "
+        f"missing); get the rest with `{command}`, or rename the shards to use only these"
     )
 
 
@@ -180,7 +180,7 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
         if expected.keys() != part.keys():
             key = min(expected.keys() ^ part.keys())
             having, other = (shard, first) if key in part else (first, shard)
-            raise UserError(f"{having}: has {key!r}, {other.name} has not; keep one dataset per folder")
+            raise UserError(f"{having}: has {key!r} and {other.name} does not; keep one dataset per folder")
         for key, value in part.items():
             if value.shape[1:] != expected[key].shape[1:]:
                 widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"

@@ -166,14 +166,14 @@ def _open(path: Path) -> Iterator[h5py.File]:
     except (OSError, RuntimeError, KeyError, ValueError) as error:
         if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
             raise UnavailableError(
-                f"{path}: another program writes it, or its disk has no locks ({os.strerror(error.errno).lower()}); "
-                "close that program and re-run the same command, or set HDF5_USE_FILE_LOCKING=FALSE to read without "
-                "locks"
+                f"{path}: another program is writing it, or its disk does not support locks "
+                f"({os.strerror(error.errno).lower()}); close that program and re-run the same command, or set "
+                "HDF5_USE_FILE_LOCKING=FALSE to read without locks"
             ) from error
         if "already open for write" in str(error):
             raise UnavailableError(
-                f"{path}: another program writes it, or was killed while it did; close that program and re-run the "
-                "same command, or remove its mark with `h5clear -s`"
+                f"{path}: another program is writing it, or was killed while writing; close that program and re-run "
+                "the same command, or clear its flag with `h5clear -s`"
             ) from error
         damaged = UserError(f"{path}: is truncated, damaged or not an HDF5 file ({in_one_line(error)}); {_REPAIR}")
         raise system_error(path, error) or damaged from error

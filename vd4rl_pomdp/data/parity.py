@@ -86,7 +86,7 @@ def _compare_background(path: Path) -> dict[str, Any]:
     """Compare the median frames of data and environment on the pixels that are static in both."""
     dataset = open_dataset(path)
     if dataset.task is None:
-        raise UserError(f"{path}: cannot tell the task; put the dataset in a folder named after it (walker_walk/)")
+        raise UserError(f"{path}: cannot determine the task; put the dataset in a folder named after it (walker_walk/)")
     rows = np.linspace(0, dataset.num_rows - 1, min(dataset.num_rows, 400)).astype(int)
     data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task, dataset.frame_size)
     static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)

@@ -95,8 +95,8 @@ def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]
     if stored and before.get("canary") != now.get("canary"):
         first, here = (info.get("gl_renderer") or "another renderer" for info in (before, now))
         raise UserError(
-            f"{out}: its shards were rendered by {first}, and {here} renders other pixels: resume on a machine like "
-            "the first, or choose another --out"
+            f"{out}: its shards were rendered by {first}, and {here} renders different pixels: resume on a machine "
+            "like the first, or choose another --out"
         )
     return now
 

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_error, disk_errors, system_error, told_apart
+from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_error, disk_errors, distinct_texts, system_error
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.folder import check_count, join_shards, shard_paths
@@ -165,7 +165,7 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
         count = len(rows["reward"])
         size, free = count * 3 * frame_size**2, shutil.disk_usage(scratch).free
         if size > free:
-            needed, available = told_apart(size / 1e9, free / 1e9, 1)
+            needed, available = distinct_texts(size / 1e9, free / 1e9, 1)
             raise DiskFullError(
                 f"{folder.parent}: decoding needs {needed} GB, the disk has {available} GB; "
                 "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"

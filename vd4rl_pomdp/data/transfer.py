@@ -102,7 +102,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     form = FORMATS.named(name)
     if form.write is None:
         writable = [other for other, one in FORMATS.items() if one.write]
-        raise UserError(f"the format {name!r} is only imported: choose one of {', '.join(writable)}")
+        raise UserError(f"the format {name!r} cannot be written: choose one of {', '.join(writable)}")
     refuse_inside(out)
     refuse_no_folder(out)
     if holds_anything(out):
@@ -239,7 +239,7 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
             small = [area_means(one.transpose(1, 2, 0), size).transpose(2, 0, 1) for one in rows[FRAMES_KEY]]
             yield rows | {FRAMES_KEY: np.stack(small)}
 
-    stretched = "" if height == width else "; height and width are scaled apart"
+    stretched = "" if height == width else "; height and width are scaled separately"
     note = f"pictures of {height}x{width} pixels become {size}x{size} (area means{stretched})"
     return replace(source, read=read, frame_shape=(size, size), notes=[*source.notes, note])
 

@@ -59,7 +59,7 @@ def check_bounds(what: str, low: np.ndarray, high: np.ndarray) -> None:
     if not ((least >= -MOST) & (least <= most) & (most <= MOST)).all():
         raise UserError(
             f"{what} has actions from {np.min(low):g} to {np.max(high):g}: only bounds within -{MOST:g} and {MOST:g} "
-            "can be rescaled to [-1, 1]; take another task, or wrap the environment in one that bounds its actions"
+            "can be rescaled to [-1, 1]; choose another task, or wrap the environment in one that bounds its actions"
         )
 
 

@@ -56,7 +56,7 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
     low, high = TRIED_MUJOCO
     if not low <= _numbers(version) < high:
         raise UserError(
-            f"mujoco {version} was never compared with the data's pixels (tested: {low[0]}.{low[1]} to below "
+            f"mujoco {version} has not been compared with the data's pixels (tested: {low[0]}.{low[1]} to below "
             f"{high[0]}.{high[1]}); install the tested pair with `pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
         )
 

@@ -45,7 +45,7 @@ MEMORIES: Registry[MemoryPart] = Registry(
         "transformer": MemoryPart(Transformer, TransformerOptions, summary="causal attention to a window of rows"),
         "lru": MemoryPart(LRU, LRUOptions, summary="linear recurrent units, computed in parallel over a window"),
         "integrator": MemoryPart(
-            Integrator, GRUOptions, summary="a GRU on the first observation, later actions and the time alone"
+            Integrator, GRUOptions, summary="a GRU on only the first observation, later actions and time"
         ),
     },
     lambda part: isinstance(part, MemoryPart),

@@ -69,7 +69,7 @@ class Pretrained(nn.Module):
                 "--model-size or --model"
             ) from error
         if not torch.equal(first, again):  # such as MAE, which masks patches at random
-            raise UserError(f"--model {name}: its features of one image differ from call to call: choose another model")
+            raise UserError(f"--model {name}: its features of one image differ between calls: choose another model")
 
     def forward(self, image: Tensor) -> Tensor:
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
@@ -111,7 +111,7 @@ def _load(name: str) -> Any:
     if pooler := {key for key in missing if "pooler." in key}:
         model.pooler = None  # many ViTs are stored without one: transformers would pool by random weights
     if lost := missing - pooler:
-        raise UserError(f"--model {name}: its file lacks {len(lost)} weights, such as {min(lost)}: fetch it again")
+        raise UserError(f"--model {name}: its file lacks {len(lost)} weights, such as {min(lost)}: download it again")
     model = getattr(model, "vision_model", model)  # CLIP and SigLIP read text, too
     return model.eval().requires_grad_(False)
 

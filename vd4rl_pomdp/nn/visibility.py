@@ -93,7 +93,7 @@ def response(
 
     if changed(obs, actions).any():
         raise ValueError(
-            "predictions differ from call to call: put the objective into eval mode, or draw from nn.draws.Draws"
+            "predictions differ between calls: put the objective into eval mode, or draw from nn.draws.Draws"
         )
     for b in range(len(lengths)):
         touched = changed(_exchange(obs, new_obs, 0, b), _exchange(actions, new_actions, 0, b))

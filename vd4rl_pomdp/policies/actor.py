@@ -29,7 +29,7 @@ LOG_STD_RANGE = (-20.0, 2.0)
 OBSERVATION_CLIP = 10.0
 """Standardised observations are clipped to +-10."""
 ASSETS = Path(__file__).parent / "assets"
-_REMEDY = "take another copy"
+_REMEDY = "use another copy"
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def read_ladder(path: Path, task: str | None = None) -> Ladder:
     ladder = Ladder(*_read(path, task))
     steps = ladder.card.get("decisions")
     if not isinstance(steps, list) or any(len(value) != len(steps) for value in ladder.weights.values()):
-        raise UserError(f"{path}: holds no ladder of actors; {_REMEDY}")
+        raise UserError(f"{path}: contains no actor snapshots; {_REMEDY}")
     for rung in ladder.rungs:
         _check_weights(path, rung, task)
     return ladder

@@ -255,8 +255,8 @@ def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
         axes.set(xlabel="gradient updates", xlim=(0, None))
         axes.set_ylim(1.05 * min(0.0, rows["low"].min()), 1.05 * max(rows["high"].max(), 0.0) or 1.0)
 
-    caption = "Learning curves under {}: mean over the seeds that have got there, bands from the lowest to the highest "
-    caption += "seed, unfinished runs among them."
+    caption = "Learning curves under {}: mean over the seeds evaluated there, bands from the lowest to the highest "
+    caption += "seed, including unfinished runs."
     return _plots(curves, "curves", caption, draw, "score")
 
 
@@ -341,7 +341,7 @@ def lead_plots(leads: pd.DataFrame) -> list[Plot]:
         axes.set(xlabel="pretraining: steps x stacks in a batch", ylabel="lead, % of the data's return")
 
     caption = (
-        "Lead against the budget of pretraining under {}: difference of mean returns, each in % of the mean return of "
+        "Lead by pretraining budget under {}: difference of mean returns, each in % of the mean return of "
         "its own data, with 95% t intervals over seeds and episodes if both sides have two seeds."
     )
     return _plots(leads, "lead", caption, draw, "difference", 2)
@@ -383,7 +383,7 @@ def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot
             for title, members in places
             for column, words in measures.items()
         ]
-        caption = f"Final return under {corruption} against {description}; further left is better. One dot a run, "
+        caption = f"Final return under {corruption} against {description}; further left is better. One dot per run, "
         caption += f"n = {len(rows)} runs."
         shown = rows[[*SETTING, "label", "seed", *measures, "return"]].rename(columns={"label": "method"})
         words, figure = f"Returns: {_in_words(places, 'return', 0)}", sheet(panels, 4 if len(places) > 1 else 2)

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import told_apart
+from vd4rl_pomdp.core.errors import distinct_texts
 from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import load, stats
@@ -47,7 +47,7 @@ NOT_REFUTED = "not refuted"  # verdict of an undecided "not below" claim
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
 DISTANCE = "distance"  # kind of a row that is a measurement, not a claim
 LEADER, OTHER = "mik+a", "acro"
-OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}
+OTHERS = {"mik+a minus acro": "method", "mik+a minus acro with a GRU": "gru"}
 """What the leader is compared with, by the difference's name: the other method's `--history`."""
 
 
@@ -99,7 +99,7 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
             recorded = all(run.reference.data_return is not None for run in everyone[words])
             unknown.append(f"the data's return is {'not above 0' if recorded else 'not known'}")
         elif share < least:
-            found, asked = told_apart(share, least, 2)
+            found, asked = distinct_texts(share, least, 2)
             missed.append(f"{words} returns {found} of the data's return, less than {asked}")
     if compared.unlike:
         unknown.append(f"best and random have other {', '.join(compared.unlike)}")

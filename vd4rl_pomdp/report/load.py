@@ -225,7 +225,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
     for run in runs:
         path = run.result.path
         if run.rows and (other := seen.setdefault(run.of(IDENTITY), path)) is not path:
-            raise UserError(f"{path} and {other}: two runs of one method, setting and seed; report one of them")
+            raise UserError(f"{path} and {other}: two runs with the same method, setting and seed; report one of them")
     return runs
 
 
@@ -480,4 +480,6 @@ def gaps_in_words(gaps: Iterable[Row]) -> str:
     """Gaps of one condition: "seeds 1, 2 missing; seed 3 unfinished at 20 of 40 updates"."""
     by_state = groups(sorted(gaps, key=lambda row: row["state"]), lambda row: str(row["state"]))
     seeds_by_state = {state: [str(row["seed"]) for row in members] for state, members in by_state.items()}
-    return "; ".join(f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)} {state}" for state, seeds in seeds_by_state.items())
+    return "; ".join(
+        f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)} {state}" for state, seeds in seeds_by_state.items()
+    )

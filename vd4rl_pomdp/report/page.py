@@ -81,7 +81,7 @@ SHOWN: dict[str, Columns] = {
         "data's return": ("data_return", 0),
         "state": ("state_share", 2),
         "acro, none": ("acro_share", 2),
-        "acro's bar": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
+        "acro's threshold": lambda row: f"{number(row['acro_bar'], 2)} ({row['bar_from']})",
         "best": ("best_share", 2),
         "best – random": ("above_random", "low", "high", 0),
     },
@@ -96,7 +96,7 @@ SHOWN: dict[str, Columns] = {
         "detectable difference": lambda row: _two(
             row["smallest"], row["smallest_share"] and 100 * row["smallest_share"], 0, "%"
         ),
-        "played clean": ("clean_difference", "clean_low", "clean_high", 0),
+        "evaluated clean": ("clean_difference", "clean_low", "clean_high", 0),
     },
     "lead": {
         "setting": with_algorithm,
@@ -153,7 +153,7 @@ SHOWN: dict[str, Columns] = {
     "elsewhere": {
         "setting": setting,
         "method": label,
-        "played under": "evaluated_under",
+        "evaluated under": "evaluated_under",
         "score": ("score", "low", "high", 1),
         "seeds": _count,
         "episodes": "episodes",
@@ -183,7 +183,7 @@ WHOLE = ("gates", "costs")
 NOTES = {
     MARK: f"{tables.SCORE}. Mean over seeds, 95% t intervals over seeds and episodes.",
     "aggregate": "Over all tasks and seeds, 95% stratified bootstrap intervals.",
-    "improvement": "Probability that a run of the row's method ends above one of the column's.",
+    "improvement": "Probability that a run of the row's method scores higher than one of the column's.",
 }
 
 
@@ -221,11 +221,13 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame) -> Iterator[Bloc
                 yield block(str(heading), columns, words, seeds_note(mine["seeds"]))
         else:
             note = seeds_note(mine["seeds"])
-            privileged = " and ".join(method for method in dict.fromkeys(mine["method"]) if method in load.TRAINED_ON_STATES)
+            privileged = " and ".join(
+                method for method in dict.fromkeys(mine["method"]) if method in load.TRAINED_ON_STATES
+            )
             if name == "representations" and privileged:
                 # A linear probe trivially reads out what the encoder was trained to predict.
-                note += f" {privileged}: trained on the states of all episodes, those that the probe holds out, too, but for"
-                note += " --hold-out."
+                note += f" {privileged}: trained on the states of all episodes, including the probe's held-out ones "
+                note += "(unless --hold-out)."
             if name == MARK:
                 note += f" Memory: {mine['memory'].iloc[0]}."
             if "no result" in shown and not shown["no result"].any():

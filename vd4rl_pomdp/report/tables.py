@@ -85,7 +85,9 @@ def mean_and_ends(scores: np.ndarray, prefix: str = "", suffix: str = "") -> Row
 def _ordered(table: pd.DataFrame, *keys: pd.Series) -> pd.DataFrame:
     """Sort by setting, then references last, then by some keys; unknown values last."""
     columns = [table[name] for name in SETTING if name in table] + [table["method"].isin(load.REFERENCES), *keys]
-    order = pd.concat(columns, axis=1, ignore_index=True).pipe(lambda frame: frame.sort_values(list(frame), kind="stable"))
+    order = pd.concat(columns, axis=1, ignore_index=True).pipe(
+        lambda frame: frame.sort_values(list(frame), kind="stable")
+    )
     return table.loc[order.index].reset_index(drop=True)
 
 

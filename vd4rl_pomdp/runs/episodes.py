@@ -71,7 +71,7 @@ def _parse(path: Path, content: bytes) -> list[Row]:
         rows: list[Row] = []
         for row in reader:
             if None in row or None in row.values() or not row["evaluated_under"]:
-                raise ValueError("it has more cells than there are columns, or fewer")
+                raise ValueError("a row has more or fewer cells than columns")
             numbers = {name: float(row[name]) for name in ("return", "score")}
             if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
                 raise UserError(

@@ -35,7 +35,7 @@ def read_json(path: Path) -> dict[str, Any]:
     with damaged(path, "cannot be read as JSON"):
         value = parse_json(read_bytes(path))
     if not isinstance(value, dict):
-        raise UserError(f"{path}: holds no JSON object")
+        raise UserError(f"{path}: is not a JSON object")
     return value
 
 

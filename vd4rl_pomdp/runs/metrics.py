@@ -135,7 +135,7 @@ class MetricsLog:
             reason = in_one_line(error) or type(error).__name__
             reason += "; `pip install '.[tracking]'` in the package's folder" if isinstance(error, ImportError) else ""
             where = self._path.parent
-            print(f"warning: {name} fails ({reason}); the run continues, {where} has it all", file=sys.stderr)
+            print(f"warning: {name} fails ({reason}); the run continues, and {where} has all metrics", file=sys.stderr)
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:

@@ -49,7 +49,7 @@ FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CON
 CERTIFICATES = "certificates.json"
 NOT_CERTIFIED = "not certified"
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
-DAMAGED = "its files are damaged", "take another copy, or leave it out"
+DAMAGED = "its files are damaged", "use another copy, or leave it out"
 """Message for a run whose files do not hold what a run writes."""
 _ROUNDING = 1e-4  # tolerance of a score; scores and returns are stored with four decimals
 
@@ -238,9 +238,9 @@ def read_results(folder: Path | str) -> list[Result]:
     except FileNotFoundError as error:
         raise UserError(f"{path.parent}: holds no {RUNS}, so it is not a results folder") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: is not UTF-8 ({error}); take another copy") from error
+        raise UserError(f"{path}: is not UTF-8 ({error}); use another copy") from error
     if not lines:
-        raise UserError(f"{path}: is empty; take another copy, or remove it")
+        raise UserError(f"{path}: is empty; use another copy, or remove it")
     where = folder / EPISODES_FILE
     for row in read_episodes(where):
         if "id" not in row:
@@ -257,7 +257,7 @@ def read_results(folder: Path | str) -> list[Result]:
             if name in runs:
                 raise UserError(f"{path}: names a run twice; remove one of the two lines")
             if len(rows) < count:
-                raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; take another copy")
+                raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; use another copy")
             files = {key: record[key] for key in FILES if key in record}
             losses = [(int(step), float(loss)) for step, loss in record.get("losses", [])]
             # ignore rows that a later, interrupted write added
@@ -309,7 +309,9 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     for run in runs:
         other = found.setdefault(run.id, run)
         if other.ending and other.ending == run.ending and not (run.extends(other) or other.extends(run)):
-            raise UserError(f"{run.path} and {other.path}: two runs of one method, setting and seed; name one of them")
+            raise UserError(
+                f"{run.path} and {other.path}: two runs with the same method, setting and seed; name one of them"
+            )
         found[run.id] = max(other, run, key=_completeness)
     return list(found.values())
 
@@ -434,7 +436,7 @@ def _contradictions(run: Result) -> Iterator[str]:
         data, mean = run.files.get("critic", {}).get("data"), run.files.get("reference", {}).get("mean_reward")
         gamma = config.get("gamma", 1)
         if None not in (data, mean) and gamma < 1 and abs(data - mean / (1 - gamma)) > _ROUNDING:
-            yield f"its critic tells of data worth {data}, their mean reward {mean} makes {mean / (1 - gamma):.4f}"
+            yield f"its critic.json has data value {data}, but mean reward {mean} gives {mean / (1 - gamma):.4f}"
         yield from _astray(run)
 
 
@@ -473,7 +475,9 @@ def _astray(run: Result) -> Iterator[str]:
         f"scores are not their returns / {divisor:g}": [
             abs(row["score"] - row["return"] / divisor) > _ROUNDING for row in run.rows
         ],
-        "action errors lack, or tell of no actor": [(row["action_error"] is None) is known for row in run.rows],
+        "action errors are missing, or present without an actor": [
+            (row["action_error"] is None) is known for row in run.rows
+        ],
     }
     yield from (f"{sum(found)} {what}" for what, found in wrong.items() if any(found))
 

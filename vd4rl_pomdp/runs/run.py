@@ -112,17 +112,17 @@ class RunFolder:
         if stored["stage"] != self.stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(
-                f"{self.path}: holds a run with a different config ({what}); choose another --out or remove it"
+                f"{self.path}: contains a run with a different config ({what}); choose another --out or remove it"
             )
         for name, now in self.inputs.items():
             if inputs.get(name) != now:
                 raise UserError(
-                    f"{self.path}: holds a run with other content of --{name} ({self.config.get(name)} was "
-                    f"{inputs.get(name)} and is {now}); restore what it began with, or choose another --out"
+                    f"{self.path}: the content of --{name} {self.config.get(name)} has changed since this run started "
+                    f"({inputs.get(name)} -> {now}); restore it, or choose another --out"
                 )
         lost = next((name for name in self._results if self.finished and not (self.path / name).exists()), None)
         if lost:
-            raise UserError(f"{self.path / lost}: is gone; {remedy(self.path)}")
+            raise UserError(f"{self.path / lost}: is missing; {remedy(self.path)}")
 
     def __enter__(self) -> Self:
         record = {} if self._begins else read_json(self.path / CONFIG_FILE)
@@ -184,7 +184,7 @@ class RunFolder:
         # The run would start over and append the same evaluations again.
         if seconds is None and read_episodes(self.path / EPISODES_FILE):
             raise UserError(
-                f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: restore them, "
+                f"{self.path}: has evaluations, but their checkpoints are missing: restore them, "
                 "or remove the folder to start the run again"
             )
         self._before = seconds or 0.0

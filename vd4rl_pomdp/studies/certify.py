@@ -127,7 +127,7 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     try:
         keep_certificates(dataset.path if dataset.path.is_dir() else dataset.path.parent, made)
     except UserError as error:  # a shared dataset may be read-only
-        print(f"warning: {error}; the certificate is in {out} alone", file=sys.stderr)
+        print(f"warning: {error}; the certificate is only in {out}", file=sys.stderr)
     return certificate
 
 

@@ -46,7 +46,7 @@ class ClusterTask:
             os.chdir(self.cwd)
         except OSError as error:
             raise UserError(
-                f"{self.cwd}: not on node {socket.gethostname()}; use a disk that all nodes share"
+                f"{self.cwd}: does not exist on node {socket.gethostname()}; use a disk that all nodes share"
             ) from error
         with interrupt.handled():
             # submitit would resubmit the task on SIGUSR2; here `watch` decides that.
@@ -149,7 +149,7 @@ class SlurmCluster:
                 time.sleep(1)
             self._ask("scancel", "--quiet")
         except UnavailableError as error:
-            print(f"warning: {error}; tasks may be left: scancel --me --name={self._name}", file=sys.stderr)
+            print(f"warning: {error}; tasks may still be running: scancel --me --name={self._name}", file=sys.stderr)
 
     def _ask(self, command: str, *words: str) -> str:
         """Stdout of a Slurm command on this sweep's tasks; UnavailableError if it fails or times out."""
@@ -211,7 +211,7 @@ class RayCluster:
             ray.shutdown()
             raise UserError(
                 f"no node of the Ray cluster has {options.cpus:.15g} CPUs and {options.gpus:.15g} GPUs: lower --cpus "
-                "or --gpus, or say with --jobs how many jobs the cluster is to grow for"
+                "or --gpus, or set --jobs, so that the cluster can grow"
             )
 
     @property

@@ -159,7 +159,7 @@ def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) 
     scale = nn.Parameter(torch.ones(()))
     transitions = batch()
     algorithm.update(transitions.replace(z=transitions.z * scale), torch.optim.SGD([scale], lr=1e-3))
-    claim(scale.item() != 1, "the encoder's optimiser takes no step: hand it to `step` with the first loss")
+    claim(scale.item() != 1, "the encoder's optimiser takes no step: pass it to `minimise` with the first loss")
 
 
 def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) -> None:

@@ -36,7 +36,7 @@ def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
     except Exception as error:  # other people's code may raise anything
         reason = str(error) if isinstance(error, AssertionError) else f"{type(error).__name__}: {error}"
         promise = (check.__doc__ or "").partition("\n")[0]
-        raise AssertionError(f"{kind} {name!r} breaks a promise.\n{promise}\nBut: {reason}") from error
+        raise AssertionError(f"{kind} {name!r} violates its contract.\nRequired: {promise}\nFound: {reason}") from error
     finally:
         np.random.set_state(drawn)  # noqa: NPY002
 

@@ -68,7 +68,7 @@ def equal_keys_give_equal_masks(name: str, **options: Any) -> None:
     obs, key, corruption = stacks(), torch.arange(100, 100 + STACKS), _make(name, options)
     whole = corruption(obs, key)
     alone = torch.cat([corruption(obs[i : i + 1], key[i : i + 1]) for i in range(STACKS)])
-    claim(torch.equal(whole, alone), "a stack looks different in a batch than alone")
+    claim(torch.equal(whole, alone), "a stack looks different in a batch than by itself")
     windows = corruption(obs.view(2, STACKS // 2, *obs.shape[1:]), key.view(2, -1))
     claim(torch.equal(windows.view_as(whole), whole), "a stack looks different in windows than in a batch")
 

@@ -87,7 +87,7 @@ def a_seed_decides_everything(name: str, **options: Any) -> None:
     for training in (True, False):
         with torch.no_grad():
             first, second = (one.train(training).frame(obs) for _ in range(2))
-        claim(torch.equal(first, second), f"features differ from call to call, training {training}")
+        claim(torch.equal(first, second), f"features differ between calls, training {training}")
 
 
 def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:

@@ -73,7 +73,7 @@ def test_episodes_are_of_the_run_that_they_name_each_once_and_scored_by_their_re
         f"run {first.id}: 1 scores are not their returns / 10",
         "2 runs, 3 contradictions between rows and records",
     ]
-    assert err == f"error: {results}: 3 contradictions, see above; ask who made the rows\n"
+    assert err == f"error: {results}: 3 contradictions, see above; ask their author\n"
 
 
 OWN = "patch+zero_frames"
@@ -87,7 +87,7 @@ EDITED_ROWS = [
     (0, {"length": "5"}, "1 lengths are not within 1 and 4"),
     (0, {"quality": "medium"}, "an episode has the quality medium, its record expert (1 such)"),
     (0, {"corruption": "none"}, "an episode has the corruption none, its record patch+zero_frames (1 such)"),
-    (0, {"action_error": "0.1"}, "1 action errors lack, or tell of no actor"),
+    (0, {"action_error": "0.1"}, "1 action errors are missing, or present without an actor"),
     (0, {"score": "0.9"}, "1 scores are not their returns / 10"),
 ]
 EDITED_RECORDS = [

@@ -95,7 +95,7 @@ def _info(folder: Path) -> dict[str, Any]:
     kinds = {"features": dict, "fps": float, "total_episodes": int, "total_frames": int, "data_path": str}
     wrong = [name for name, kind in kinds.items() if not (info.get(name) and fits(info[name], kind))]
     if wrong := wrong or [name for name, one in info["features"].items() if not {"dtype", "shape"} <= {*one}]:
-        raise UserError(f"{path}: its {wrong[0]} is missing or damaged; fetch it again")
+        raise UserError(f"{path}: its {wrong[0]} is missing or damaged; download it again")
     return info
 
 
@@ -107,7 +107,7 @@ def _episodes(pq: Any, folder: Path, info: dict[str, Any]) -> dict[str, list[Any
     table = _arrow().concat_tables(tables).sort_by("episode_index").to_pydict() if index else {"length": []}
     for what, found in (("episodes", len(table["length"])), ("frames", sum(table["length"]))):
         if found != (total := info[f"total_{what}"]):
-            raise UserError(f"meta/episodes has {found} of {total} {what}; fetch it again")
+            raise UserError(f"meta/episodes has {found} of {total} {what}; download it again")
     return table
 
 
@@ -127,7 +127,7 @@ def _stored(
                     continue
                 stored = {name: _dense(table[name].combine_chunks()) for name in columns}
                 if len(table) < lengths[number] or (stored["episode_index"] != number).any():
-                    raise UserError(f"{path.name} lacks rows that meta/episodes lists; fetch it again")
+                    raise UserError(f"{path.name} lacks rows that meta/episodes lists; download it again")
                 yield number, stored
 
 
@@ -193,8 +193,8 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
                 if len(pictures) == len(times):
                     return _stacked(pictures)
     except av.error.InvalidDataError as error:
-        raise UserError(f"{path.name} is damaged or not a video; fetch it again") from error
-    raise UserError(f"{path.name} has no frame at {times[len(pictures)]:.3f} s; fetch it again")
+        raise UserError(f"{path.name} is damaged or not a video; download it again") from error
+    raise UserError(f"{path.name} has no frame at {times[len(pictures)]:.3f} s; download it again")
 
 
 def _rows(stored: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:
@@ -211,7 +211,7 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
     """Write a data set for `LeRobotDataset(NAME, root=FOLDER)`, with images as PNG in the rows or as H.264 videos."""
     size, end, files = source.frame_shape[0], 0, 0
     if video and size % 2:
-        raise UserError(f"video needs an even height and width, not {size}: pass --size, or take `lerobot`")
+        raise UserError(f"video needs an even height and width, not {size}: pass --size, or use the format `lerobot`")
     png, held, index, changes = _png_encoder(size), list[Any](), list[dict[str, Any]](), list[tuple[float, int]]()
     lost = {f"steps have no duration here: in the export they are {_FPS} a second": None}
     for number, rows in enumerate(source.read(0)):
@@ -366,5 +366,7 @@ def _numbered(prefix: str, number: int) -> dict[str, Any]:
     return {f"{prefix}chunk_index": number // _CHUNK, f"{prefix}file_index": number % _CHUNK}
 
 
-LEROBOT = DataFormat("LeRobot's sets, version 3; written with PNG pictures", read_lerobot, write_lerobot)
-LEROBOT_VIDEO = DataFormat("LeRobot's sets, version 3; with video", read_lerobot, partial(write_lerobot, video=True))
+LEROBOT = DataFormat("LeRobot datasets, version 3; written as PNG images", read_lerobot, write_lerobot)
+LEROBOT_VIDEO = DataFormat(
+    "LeRobot datasets, version 3; written as video", read_lerobot, partial(write_lerobot, video=True)
+)

@@ -145,5 +145,5 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
 
 
 MINARI = DataFormat(
-    "Minari's sets, HDF5 or Arrow; what its DataCollector records of a Gymnasium environment", read, write
+    "Minari datasets, HDF5 or Arrow, as its DataCollector records them from a Gymnasium environment", read, write
 )

@@ -31,7 +31,9 @@ def read(source: str, picture: str | None) -> SourceSet:
     if action.dtype.kind != "f":
         raise UserError(f"has actions of {action.dtype}, expected floating point")
     if not len(action) == len(terminals) == shape[0]:
-        raise UserError(f"has {shape[0]} images, {len(action)} actions and {len(terminals)} terminals; fetch it again")
+        raise UserError(
+            f"has {shape[0]} images, {len(action)} actions and {len(terminals)} terminals; download it again"
+        )
     ends = np.flatnonzero(terminals) + 1
     if not len(ends) or ends[-1] != len(terminals):
         raise UserError("its last episode has no end")
@@ -69,4 +71,4 @@ def _observations(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, ...], np.d
         yield stream, shape, dtype
 
 
-OGBENCH = DataFormat("OGBench's visual sets, one .npz file each", read)
+OGBENCH = DataFormat("OGBench's visual datasets, one .npz file each", read)

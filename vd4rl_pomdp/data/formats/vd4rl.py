@@ -75,13 +75,13 @@ def _episode(path: Path) -> EpisodeArrays:
         with np.load(path) as file:
             stored = {key: file[key] for key in file.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); fetch it again") from error
+        raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); download it again") from error
     if missing := [key for key in ("image", "action", "reward") if key not in stored]:
         raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
     rows = len(stored["reward"])
     for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
         if (count := len(stored.get(key, stored["reward"]))) != rows:
-            raise UserError(f"{path}: {key!r} has {count} rows, 'reward' {rows}; fetch it again")
+            raise UserError(f"{path}: {key!r} has {count} rows, 'reward' {rows}; download it again")
     step_type = np.full(rows, StepType.MID, np.int64)
     step_type[-1:] = StepType.LAST if stored.get("is_last", np.ones(1))[-1:].any() else StepType.MID
     step_type[:1] = StepType.FIRST
@@ -114,5 +114,5 @@ def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
     return ["simulator states are not kept"] if states else []
 
 
-VD4RL = DataFormat("V-D4RL's HDF5 shards, which are this package's own: to change the size of frames", read_shards)
-VD4RL_NPZ = DataFormat("V-D4RL's 64-pixel .npz episodes, as DreamerV2 reads them", read_npz, write_npz)
+VD4RL = DataFormat("V-D4RL's HDF5 shards, this package's own format: to change the frame size", read_shards)
+VD4RL_NPZ = DataFormat("V-D4RL's 64-pixel .npz episodes, in DreamerV2's layout", read_npz, write_npz)

@@ -41,7 +41,7 @@ class MazeCollectConfig(StageConfig):
     """Settings of `vd4rl-pomdp navigation collect`."""
 
     maze: str = ""
-    """no_curtain, one_curtain, three_curtains or first_person; compass_first_person; or one of the four after hard_."""
+    """no_curtain, one_curtain, three_curtains or first_person, these with the prefix hard_, or compass_first_person."""
     out: Path = Path()
     """Folder of the dataset."""
     trajectories: int = 500

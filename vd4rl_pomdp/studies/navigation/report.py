@@ -311,16 +311,16 @@ def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
     return [
         "## Which statements hold",
         "",
-        f"{sum(judged)} of {len(judged)} hold, {len(found) - len(judged)} wait for runs. "
+        f"{sum(judged)} of {len(judged)} hold, {len(found) - len(judged)} have no runs yet. "
         f"Of {len(both)} that are judged in both units, {changes}.",
         "Wording and bounds are this package's. "
         f"Of those for which the paper prints numbers, {sum(printed)} of {len(printed)} hold.",
-        "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds` says how many hold alone.",
+        "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds`: how many it holds for.",
         "",
         *table_lines(head, rows, range(len(head))),
         "",
-        "That ah+a beats the untrained encoder is not to be expected: it reads an action from its record of past ones",
-        f"and need not keep the state. In the paper its position error is {recorder}.",
+        "ah+a need not beat the untrained encoder: it can read an action from its record of past ones",
+        f"instead of keeping the state. In the paper its position error is {recorder}.",
         "",
     ]
 
@@ -332,18 +332,18 @@ _CAPTIONS = {
     "accuracy_raw.png": ("The same in raw units", "The paper's marks are training averages."),
     "trajectories.png": (
         "True and estimated trajectories",
-        "From the first row on, where little was seen: errors count later ones.",
+        "From the first row on; errors exclude the first rows, where little was seen.",
     ),
-    "observations.png": ("Sample observations", "What a model is shown along a drive through each maze."),
+    "observations.png": ("Sample observations", "Observations along one trajectory in each maze."),
 }
 _HARD = """\
-`hard_` mazes are variants of the paper's. Three wider curtains hide the mass 36% of the time (its own:
-some 22%), every action is noisy (not a tenth of them zero and a tenth random), and the first person has
-another camera, a black sky and other kinematics. The paper's numbers are of its own mazes.
+`hard_` mazes are variants of the paper's. Three wider curtains hide the mass 36% of the time (the paper's:
+about 22%), every action is noisy (not a tenth of them zero and a tenth random), and the first person has
+another camera, a black sky and other kinematics. The paper's numbers are for its mazes.
 """
 _READING = """\
 Errors are given in two units: percent of a standard deviation, and the simulator's own units x 100. The paper's
-percentages are most likely the latter, so its numbers stand beside those alone.
+percentages are most likely the latter, so its numbers are compared with those only.
 
 A cell of a table reads: **mean over seeds** [95% t interval] n=seeds (the paper's number).
 Missing: "n=1 of 3" where other cells of the maze have three seeds,
@@ -352,9 +352,9 @@ Missing: "n=1 of 3" where other cells of the maze have three seeds,
 _COMMANDS = """\
 ## Commands
 
-Each line computes one run, and says on which maze and in how many seconds (wall-clock); `navigation collect` makes
-its data, as `collection` in runs.jsonl says. Folders are as they were told: sets of two mazes may have lain under one
-name, on different machines. The grids `navigation` (the paper's own mazes) and `first_person` print the lines of all
+Each line computes one run, followed by its maze and wall-clock seconds; `navigation collect` makes its data, by
+`collection` in runs.jsonl. Folders are those of the original commands: datasets of two mazes may have had the same
+name on different machines. The grids `navigation` (the paper's own mazes) and `first_person` print the lines of all
 cells: `vd4rl-pomdp sweep run GRID --out runs --dry-run`.
 """
 

@@ -189,7 +189,9 @@ def _jumps(world: World) -> tuple[str, str, str, str]:
     m = least_memory(world).m
     near, far = (always_apart(relation(world, VIEWS["fj+a"], MemoryLengths(m, m), range(1, k + 1))) for k in (m, m + 2))
     masked = always_apart(relation(world, VIEWS["mik+a literal"], MemoryLengths(m, m), range(1, m + 1)))
-    quantity = f"pairs of states apart by fj+a, k up to {m + 2} (k up to {m}: {near[0]}; mik+a literal: {masked[0]})"
+    quantity = (
+        f"pairs of states separated by fj+a, k up to {m + 2} (k up to {m}: {near[0]}; mik+a literal: {masked[0]})"
+    )
     return world.name, quantity, str(near[0]), f"{far[0]} of {far[1]}"
 
 
@@ -197,7 +199,12 @@ def _merged(world: World) -> tuple[str, str, str, str]:
     """State pairs that MIK+A's past encoder must separate, with both actions equally likely."""
     reach = _reach(world)
     apart, pairs = always_apart(relation(world, VIEWS["mik+a"], least_memory(world), range(1, reach + 1)))
-    return world.name, f"pairs of states apart by mik+a, k up to {reach}", f"{pairs} of {pairs}", f"{apart} of {pairs}"
+    return (
+        world.name,
+        f"pairs of states separated by mik+a, k up to {reach}",
+        f"{pairs} of {pairs}",
+        f"{apart} of {pairs}",
+    )
 
 
 def _codes(world: World) -> tuple[str, str, str, str]:

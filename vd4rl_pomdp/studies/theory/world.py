@@ -109,7 +109,7 @@ def finite_world(
         if differ := [xi for xi, row in zip(exogenous, found, strict=True) if row != found[0]]:
             raise UserError(
                 f"world {name!r}: the policy reads the exogenous part (at state {s} it differs between "
-                f"{exogenous[0]} and {differ[0]}): make it depend on the agent-centric state alone"
+                f"{exogenous[0]} and {differ[0]}): make it depend only on the agent-centric state"
             )
     return World(
         name,
