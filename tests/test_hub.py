@@ -159,7 +159,7 @@ def test_only_whole_encoders_and_sets_go_to_repositories_of_their_kind(hub, enco
         with pytest.raises(UserError, match="is not a repository: write OWNER/NAME for an encoder, datasets/OWNER"):
             push(encoder, text)
     for folder, where in ((tmp_path / "run", ENCODER), (encoder, SET), (data, ENCODER)):
-        with pytest.raises(UserError, match=f"holds .*, not .*, which {where} is the name for"):
+        with pytest.raises(UserError, match=f"contains .*, but {where} is a name for"):
             push(folder, where)
     (encoder / "model.safetensors").write_bytes(b"damaged")
     with pytest.raises(UserError, match="cannot be read"):

@@ -297,7 +297,7 @@ def test_changed_data_or_another_encoder_is_refused_and_nothing_is_touched(encod
     for finished in (True, False):
         before = contents(tmp_path)
         for run, config, name in attempts:
-            with pytest.raises(UserError, match=f"holds a run with other content of --{name}"):
+            with pytest.raises(UserError, match=f"the content of --{name} .* is not what this run started"):
                 run(config)
         assert contents(tmp_path) == before
         if finished:
@@ -312,7 +312,7 @@ def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, finetun
     (config.out / "timing.json").unlink()
     shutil.rmtree(config.out / "checkpoints")
     before = (config.out / "episodes.csv").read_bytes()
-    with pytest.raises(UserError, match=r"run: has evaluations, but the checkpoints .* are gone: restore them"):
+    with pytest.raises(UserError, match=r"run: has evaluations, but their checkpoints are missing: restore them"):
         run_finetune(config)
     assert (config.out / "episodes.csv").read_bytes() == before
 

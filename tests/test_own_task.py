@@ -156,7 +156,7 @@ def test_what_a_task_cannot_give_is_refused_before_anything_is_written(tasks, tm
     ("task", "told"),
     [
         (GymnasiumTask("Centre-v0", pixels="Render"), "unknown pixels 'Render'"),
-        (GymnasiumTask("Centre-v0", action_noise=-1.0), "its action_noise is -1.0: it must be a number that is not"),
+        (GymnasiumTask("Centre-v0", action_noise=-1.0), "its action_noise is -1.0: it must be 0 or a positive number"),
         (GymnasiumTask("Centre-v0", action_noise="0.3"), "its action_noise is '0.3'"),
         (GymnasiumTask("Centre-v0", score_divisor="10"), "its score_divisor is '10': it must be a positive number"),
         (DMCTask("cartpole", "swingup", camera="side"), "its camera is 'side': it must be the camera's number"),

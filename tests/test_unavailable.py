@@ -170,7 +170,7 @@ def test_a_shard_that_is_marked_as_being_written_is_not_called_damaged(tmp_path)
         file["action"] = np.zeros(3)
         file.flush()
         copyfile(tmp_path / "open.hdf5", tmp_path / "copy.hdf5")
-    with pytest.raises(UnavailableError, match="another program writes it, or was killed while it did"):
+    with pytest.raises(UnavailableError, match="another program is writing it, or was killed while writing"):
         read_rows(tmp_path / "copy.hdf5")
 
 

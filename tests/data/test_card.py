@@ -57,7 +57,7 @@ def test_a_published_set_gets_a_card_without_an_origin(tmp_path):
 
 def test_one_shard_of_a_set_gets_no_card(tmp_path):
     folder = write_fake_set(tmp_path / "set", (12, 30, 20), cuts=(40, 50))
-    with pytest.raises(UserError, match="describes a whole set"):
+    with pytest.raises(UserError, match="describes a whole dataset"):
         write_card(module.shard_paths(folder)[0])
     assert not list(folder.glob("card.*"))
 

@@ -165,9 +165,7 @@ def test_what_is_not_published_is_refused(tmp_path, arguments, message):
 @pytest.mark.usefixtures("mirror", "own_cache")
 def test_a_part_of_a_published_set_is_told_with_what_gets_the_rest(tmp_path):
     place = write_fake_set(tmp_path / EXPERT, names=["0_a_expert.hdf5"])
-    part = (
-        f"{place}: is a part of V-D4RL's walker_walk expert, 1 of 2 shards (1_a_expert.hdf5 is missing); get the rest "
-    )
+    part = f"{place}: contains 1 of 2 shards of V-D4RL's walker_walk expert (1_a_expert.hdf5 is missing); get the rest "
     command = f"`vd4rl-pomdp data download --task walker_walk --quality expert --out {tmp_path}`"
     for tell in (open_dataset, write_card, lambda folder: push(folder, "datasets/lab/set")):
         with pytest.raises(UserError, match=re.escape(f"{part}with {command}")):

@@ -408,7 +408,7 @@ def test_a_cut_export_leaves_nothing_and_begins_anew(tmp_path, monkeypatch):
     assert {name for name in os.listdir(tmp_path) if "npz" in name} == {"npz"}
     with pytest.raises(UserError, match="is not empty"):
         export_set("vd4rl_npz", folder, tmp_path / "npz")
-    with pytest.raises(UserError, match="only imported: choose one of lerobot, lerobot_video, minari, vd4rl_npz"):
+    with pytest.raises(UserError, match="cannot be written: choose one of lerobot, lerobot_video, minari, vd4rl_npz"):
         export_set("ogbench", folder, tmp_path / "b")
 
 

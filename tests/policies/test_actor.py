@@ -89,7 +89,7 @@ def test_whole_files_whose_weights_are_no_actor_are_refused(tmp_path, how):
 def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
     with pytest.raises(UserError, match="do not fit an actor"):
         read_actor(actor.ASSETS / "walker_walk_replay.safetensors")
-    with pytest.raises(UserError, match="holds no ladder"):
+    with pytest.raises(UserError, match="contains no actor snapshots"):
         read_ladder(actor.ASSETS / "walker_walk_medium.safetensors")
 
 

@@ -18,7 +18,7 @@ def test_bad_input_is_one_line(tmp_path):
         write_report([tmp_path / "empty"], tmp_path / "out")
     write_run(tmp_path / "a", "acro", 0, {10: [1.0]})
     write_run(tmp_path / "b", "acro", 0, {10: [2.0]})
-    with pytest.raises(UserError, match="two runs of one method"):
+    with pytest.raises(UserError, match="two runs with the same method"):
         write_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
     (tmp_path / "a" / "metrics.jsonl").write_text("{\n")
     with pytest.raises(UserError, match="a line is not JSON of numbers"):

@@ -225,7 +225,7 @@ def test_a_failing_wandb_warns_once_and_metrics_go_on(tmp_path, monkeypatch, cap
         log.write(step, {"loss": 0.5})
     log.close()
     warnings = capsys.readouterr().err.splitlines()
-    assert warnings == [f"warning: wandb fails ({place} broke); the run continues, {tmp_path} has it all"]
+    assert warnings == [f"warning: wandb fails ({place} broke); the run continues, and {tmp_path} has all metrics"]
     assert faulty.calls.count(place) == 1
     assert len(read_metrics(tmp_path / "metrics.jsonl")) == 3
 

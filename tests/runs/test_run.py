@@ -45,7 +45,9 @@ def test_only_the_same_run_resumes_wherever_its_data_lies(tmp_path):
         assert again.finished
     with pytest.raises(UserError, match=r"a different config \(seed\)"):
         begin(tmp_path, seed=1)
-    with pytest.raises(UserError, match=r"other content of --data \(data was abc and is xyz\); restore what it began"):
+    with pytest.raises(
+        UserError, match=r"the content of --data data is not what this run started with \(abc, now xyz\)"
+    ):
         begin(tmp_path, {"data": "xyz"})
     with pytest.raises(UserError, match=r"stage stage"):
         RunFolder(tmp_path, "other", Config(tmp_path), INPUTS)

@@ -94,7 +94,7 @@ def test_what_slurm_refuses_or_does_not_answer_is_one_line_and_stopping_asks_bef
     with pytest.raises(UnavailableError, match=r"Slurm does not answer: squeue has not ended after 0\.5 s"):
         cluster.live()
     cluster.stop()
-    assert "tasks may be left: scancel --me --name=" in capsys.readouterr().err
+    assert "tasks may still be running: scancel --me --name=" in capsys.readouterr().err
 
 
 def test_slurms_options_become_what_submitit_takes():

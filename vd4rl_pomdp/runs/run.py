@@ -117,8 +117,8 @@ class RunFolder:
         for name, now in self.inputs.items():
             if inputs.get(name) != now:
                 raise UserError(
-                    f"{self.path}: the content of --{name} {self.config.get(name)} has changed since this run started "
-                    f"({inputs.get(name)} -> {now}); restore it, or choose another --out"
+                    f"{self.path}: the content of --{name} {self.config.get(name)} is not what this run started with "
+                    f"({inputs.get(name)}, now {now}); restore that, or choose another --out"
                 )
         lost = next((name for name in self._results if self.finished and not (self.path / name).exists()), None)
         if lost:
