@@ -100,8 +100,8 @@ EDITED_RECORDS = [
         f"at step 20 under {OWN} it has the episodes [0, 1], its record 3, from 0 on",
     ),
     (("encoder", "pretrain", "corruption", "patch_size"), 24, "its encoder says patch_size 24, its settings 16"),
-    (("critic", "data"), 1.0, "its critic tells of data worth 1.0, their mean reward"),
-    (("reference", "mean_reward"), 1.0, "their mean reward 1.0 makes 100.0000"),
+    (("critic", "data"), 1.0, "its critic.json has data value 1.0, but mean reward"),
+    (("reference", "mean_reward"), 1.0, "but mean reward 1.0 gives 100.0000"),
 ]
 
 
