@@ -32,6 +32,31 @@ def interrupted(*arguments):
     raise KeyboardInterrupt
 
 
+def test_an_agent_remembers_its_actions_whatever_its_caller_does_to_their_arrays():
+    agent = load_agent("walker_walk/medium_expert/patch+zero_frames/mik+a")
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 9, 84, 84), dtype=np.uint8)
+
+    def last_action(spoil, executed=None):
+        agent.reset()
+        for picture in pictures:
+            action = agent.act(picture)
+            chosen = action.copy()
+            if spoil:
+                action *= 0
+            if executed is not None:
+                agent.set_last_action(executed(buffer := np.full(6, 0.25)))
+                buffer *= spoil
+        return chosen.tolist()
+
+    assert last_action(spoil=True) == last_action(spoil=False)
+    told = last_action(spoil=False, executed=list)
+    assert told != last_action(spoil=False)
+    for executed in (np.asarray, np.float32, torch.tensor):
+        assert last_action(spoil=True, executed=executed) == told
+    with pytest.raises(UserError, match="6 finite numbers"):
+        agent.set_last_action(np.zeros(3))
+
+
 def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop(
     data, encoder, tmp_path, capsys, monkeypatch
 ):

@@ -22,6 +22,7 @@ from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metad
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, Task
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.envs.pixels import checked_action
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.frame import StateFrame
@@ -63,11 +64,15 @@ class Agent:
         # step() gives the same states that training computed with encode() on whole windows
         z, self._state = self.encoder.step(torch.as_tensor(obs)[None], self._action, self._state)
         self._action = self.policy(z)
-        return self._action[0].numpy()
+        return self._action[0].numpy().copy()  # a caller's `action += noise` must not change the history
 
     def set_last_action(self, action: np.ndarray) -> None:
-        """Replace the last action in the history, if the executed (A,) action was not the one `act` returned."""
-        self._action = torch.from_numpy(action)[None]
+        """Replace the last action in the history, if the executed (A,) action was not the one `act` returned.
+
+        UserError unless it is A finite numbers.
+        """
+        executed = checked_action(action, self.encoder.config.action_dim)
+        self._action = torch.tensor(executed, dtype=torch.float32)[None]  # a copy: the caller may reuse the array
 
 
 def load_agent(name: Path | str) -> Agent:
