@@ -70,6 +70,8 @@ def test_the_testing_subset_replaces_everything_and_changes_come_last_with_the_t
     assert {(cell.value("steps"), cell.value("learning_rate"), cell.value("method")) for cell in cells} == {
         (10, 1e-3, "mik")
     }
+    with pytest.raises(UserError, match="seed is changed twice; for several values write them as in seed=0,1"):
+        load_grid(path, ["seed=3", "pretrain.steps=10", "seed = 4"])
 
 
 def test_a_python_file_defines_the_same(file):

@@ -144,6 +144,9 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
             if not isinstance(found, list):
                 raise UserError(f"its {kind}s are not a list of tables: write [[{kind}]]")
         blocks, common = [_sections(block) for block in tables["block"] or [{}]], _sections(content)
+        changed = [text.partition("=")[0].strip() for text in changes]
+        if twice := [name for name in changed if changed.count(name) > 1]:
+            raise UserError(f"{twice[0]} is changed twice; for several values write them as in seed=0,1")
         last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
         whole = [_merge(common, block) for block in blocks]
         for block in whole:
