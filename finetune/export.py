@@ -77,7 +77,8 @@ def replay_agent(folder: Path) -> Row:
 
 
 def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple[list[Row], list[list[Episode]]]:
-    """Play the same episodes with several agents, under the first one's corruption. First episodes are filmed.
+    """Play the same episodes with several agents, as long and under the corruption as the first one's card tells.
+    First episodes are filmed.
 
     Returns the cards of the agents (shipped ones, or folders) and each one's episodes. UserError if none is named, one
     is unknown or damaged, or their tasks differ.
@@ -90,8 +91,9 @@ def play_agents(names: list[str], episodes: int = 10, workers: int = 0) -> tuple
     cards = [card for _, card in found]
     if len({card["task"] for card in cards}) > 1:
         raise UserError(f"agents must have the same task, not {' and '.join(card['task'] for card in cards)}")
-    task, under = TASKS.named(cards[0]["task"]), [CorruptionConfig.fill(cards[0]["corruption"])]
-    jobs = [job for folder, card in found for job in jobs_of(folder, task, under, episodes, card["length"], film=True)]
+    first = cards[0]
+    task, under = TASKS.named(first["task"]), [CorruptionConfig.fill(first["corruption"])]
+    jobs = [job for folder, _ in found for job in jobs_of(folder, task, under, episodes, first["length"], film=True)]
     played = evaluate(jobs, workers)
     return cards, [played[start : start + episodes] for start in range(0, len(played), episodes)]
 

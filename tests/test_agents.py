@@ -1,6 +1,7 @@
 """An exported agent, loaded in one line, plays its card's episodes to the digit; what is damaged or unknown is told."""
 
 import io
+import shutil
 
 import numpy as np
 import pytest
@@ -86,7 +87,9 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
             rewards.append(now.time_step.reward)
         assert (round(float(np.cumsum(rewards)[-1]), 4), len(rewards)) == (row["return"], row["length"])
     film = tmp_path / "new" / "film.webp"
-    main(["agents", "play", str(out), str(out), "--episodes", "2", "--film", str(film), "--workers", "1"])
+    longer = shutil.copytree(out, tmp_path / "longer")  # as if exported from a run with a greater --eval-length
+    write_json(longer / "card.json", card | {"length": 12})
+    main(["agents", "play", str(out), str(longer), "--episodes", "2", "--film", str(film), "--workers", "1"])
     head, first, second, less, written = capsys.readouterr().out.splitlines()
     assert head.startswith(f"2 episodes of {card['task']} under patch+zero_frames")
     mean = np.mean([row["return"] for row in card["episodes"][:2]])

@@ -74,7 +74,8 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
 def play(
     agents: tyro.conf.Positional[list[str]], episodes: int = 10, film: Path | None = None, workers: int = 0
 ) -> None:
-    """Play the same episodes with several agents of one task, under the first one's corruption: returns and a video.
+    """Play the same episodes with several agents of one task, with the corruption and length of the first one's card:
+    returns and a video.
 
     Args:
         agents: Names of shipped agents, or folders from `agents export` and `hub pull`.
