@@ -25,7 +25,6 @@ from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.data import View, open_dataset
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
-from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.episodes import read_episodes
@@ -118,18 +117,6 @@ def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into
     assert (rows["reward"][last][ended] > 0.8).all(), "in the middle the reward is largest"
     dataset = open_dataset(tmp_path / "set")
     assert View(dataset).transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
-
-
-def test_actions_are_rescaled_and_pictures_shrunk(tasks):
-    env = make_env(TASKS["centre"], size=60)
-    env.reset(3)
-    before = env.env.place.copy()
-    row = env.step(np.array([1.0, -0.5], np.float32))
-    np.testing.assert_allclose(env.env.place, np.clip(before + 0.015 * np.array([3.0, -1.5]), -1, 1), rtol=1e-6)
-    picture = env.env.render()
-    mean = picture.reshape(60, 2, 60, 2, 3).astype(float).mean((1, 3)).transpose(2, 0, 1)
-    assert np.abs(row.frame - mean).max() <= 0.5
-    assert (row.state.size, row.physics.size) == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -240,12 +227,3 @@ def test_a_set_that_is_not_whole_is_not_continued_by_a_task_whose_file_changed(t
     with pytest.raises(UserError, match=r"set: is unfinished, and the code of task centre has changed since"):
         collect_by(CODE + "# changed\n")
     assert collect_by(CODE) == [first, second]
-
-
-def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):
-    config = CollectConfig("centre", "random", tmp_path / "set", episodes=2, workers=1)
-    collect(config, 8)
-    assert json.loads((tmp_path / "set" / "collection.json").read_text())["frame_size"] is None
-    with pytest.raises(UserError, match="differs in frame_size"):
-        collect(replace(config, frame_size=64), 8)
-    collect(config, 8)

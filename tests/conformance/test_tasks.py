@@ -62,11 +62,6 @@ class Unseeded(Square):
         return self.drawn
 
 
-class Infinite(Square):
-    def step(self, action):
-        return np.array([0]), np.inf, False, False, {}
-
-
 class Failing(Square):
     def step(self, action):
         raise RuntimeError("the motor is off")
@@ -154,9 +149,6 @@ def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
     check_task("reacher")
     with pytest.raises(UserError, match="unknown task 'mine'"):
         check_task("mine")
-    tasks.register("infinite", GymnasiumTask(Infinite))
-    with pytest.raises(UserError, match="environment Infinite returns the reward inf"):
-        check_task("infinite")
 
 
 @pytest.mark.parametrize("task", ["lqr_2_1", "lqr_6_2"])

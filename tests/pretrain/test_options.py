@@ -99,9 +99,6 @@ def test_a_gap_beyond_the_window_is_refused(max_k, window):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"max_k": 0}, "--max-k is 0"),
-        ({"self_prediction": float("nan")}, "--self-prediction is nan"),
-        ({"corruption": "patch", "patch_fill": 256}, "--patch-fill is 256"),
         ({"action_target": "ordinal"}, "unknown action target 'ordinal'"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
         ({"method": "mik", "history": "none"}, "unknown --history 'none': choose one of method, gru"),

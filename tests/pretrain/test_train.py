@@ -1,4 +1,4 @@
-"""Pretraining: cut anywhere and started again, it ends in the files of an uninterrupted run."""
+"""Pretraining: what an encoder records, and what is refused. Cut runs are in `test_interruptions.py`."""
 
 import json
 import math
@@ -6,33 +6,14 @@ import math
 import pytest
 import torch
 
-from pretrain.objectives import METHODS
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import CutError, contents, cut_at, smoke_pretrain
+from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
 
 pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-@pytest.mark.parametrize("method", ["mik+a", "curl", "supervised+a"])
-def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
-    """An inverse model, one with a momentum encoder, and one that is told states; `check_method` proves it of all."""
-    if METHODS.named(method).regresses_state:
-        data = write_fake_set(tmp_path / "with_states" / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
-    whole = run_pretrain(smoke_pretrain(data, tmp_path / "whole", method=method))
-    cut = smoke_pretrain(data, tmp_path / "cut", method=method)
-    with monkeypatch.context() as patch:
-        cut_at(patch, 2)
-        with pytest.raises(CutError):
-            run_pretrain(cut)
-    assert not (tmp_path / "cut" / "encoder").exists()
-    run_pretrain(cut)
-    assert contents(tmp_path / "cut") == contents(whole.path)
-    again = run_pretrain(cut)
-    assert contents(again.path) == contents(whole.path)
 
 
 def test_an_encoder_tells_how_it_was_pretrained(encoder):
@@ -41,18 +22,6 @@ def test_an_encoder_tells_how_it_was_pretrained(encoder):
         *("mik+a", 3, "patch+zero_frames", "walker_walk"),
     )
     assert not {"seed", "data", "out", "device", "log_every", "checkpoint_every", "wandb"} & set(settings)
-
-
-def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, tmp_path):
-    run_pretrain(smoke_pretrain(data, tmp_path / "run"))
-    before = contents(tmp_path / "run")
-    with pytest.raises(UserError, match=r"a different config \(seed\)"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "run", seed=1))
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.txt").write_text("mine")
-    with pytest.raises(UserError, match="not empty"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "full"))
-    assert contents(tmp_path / "run") == before
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import h5py
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import open_dataset, shards
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
@@ -101,22 +100,6 @@ def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones()
     noisy = np.array([_explore(np.zeros(2), MAZES["hard_no_curtain"].style, rng) for _ in range(4000)])
     assert noisy.std(0) == pytest.approx(0.48, abs=0.03)
     assert not (noisy == 0).all(1).any()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"maze": "spiral"}, "unknown --maze 'spiral'"),
-        ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
-        ({"trajectory_rows": 2**20 + 1}, "--trajectory-rows is 1048577"),
-        ({"action_repeat": 0}, "--action-repeat is 0"),
-        ({"seed": -1}, "--seed is -1"),
-    ],
-)
-def test_wrong_settings_are_named(changes, message, tmp_path):
-    with pytest.raises(UserError, match=message):
-        collect(small(tmp_path / "set", **changes))
-    assert not (tmp_path / "set").exists()
 
 
 def test_first_person_data_holds_headings_and_moves(tmp_path):
