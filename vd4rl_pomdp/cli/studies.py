@@ -107,15 +107,17 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
         folder: The results folder.
         replay: Folder of a run with encoder and policy; the first episode of its last evaluation is replayed.
     """
-    from finetune.evaluation import REPLAYED  # loads OpenGL
-    from finetune.evaluation import replay as play_again
+    from finetune import evaluation  # loads OpenGL
 
     runs, wrong = verify_results(folder)
     print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
     if replay is not None:
-        row, now, where = play_again(replay, runs)
+        row, now, where = evaluation.replay(replay, runs)
         print(f"episode 0 under {row['evaluated_under']} replays to a return of {now['return']}")
-        if differ := [f"{name} {now[name]} where it says {row[name]}" for name in REPLAYED if now[name] != row[name]]:
+        differ = [
+            f"{name} {now[name]} where it says {row[name]}" for name in evaluation.REPLAYED if now[name] != row[name]
+        ]
+        if differ:
             same = "digits are the same only where these are"
             raise UserError(f"{replay}: replays to {', '.join(differ)}; {where}: {same}")
     if wrong:

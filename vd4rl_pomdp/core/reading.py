@@ -10,13 +10,14 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 from zipfile import BadZipFile
 
-from vd4rl_pomdp.core.errors import UserError, disk_error
+import torch
+from safetensors.torch import load
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from vd4rl_pomdp.core.errors import UserError, disk_error
 
 T = TypeVar("T")
 _PARSING = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, csv.Error, BadZipFile, zlib.error)
@@ -104,9 +105,6 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     Raises:
         FileNotFoundError, SafetensorError: the file is missing, or is no safetensors file.
     """
-    import torch
-    from safetensors.torch import load
-
     tensors = load(read_bytes(path))
     bad = next((n for n, v in tensors.items() if v.is_floating_point() and not torch.isfinite(v).all()), None)
     if bad is not None:

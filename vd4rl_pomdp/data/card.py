@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
@@ -105,8 +106,6 @@ def _film(
 
 
 def _picture(title: str, returns: np.ndarray, published: float | None, film: np.ndarray) -> bytes:
-    from matplotlib.figure import Figure  # slow to load
-
     figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
     low, top = min(returns.min(), 0.0), max(returns.max(), published or 0.0, 1.0)

@@ -74,7 +74,7 @@ def _git(root: Path, *words: str) -> str:
 
 def machine(device: str = "auto") -> dict[str, Any]:
     """Hardware of a run on a device: processor, cores, memory and GPU. No host or user names."""
-    import torch
+    import torch  # here, since setup.py loads this file where nothing is installed
 
     from vd4rl_pomdp.core.hardware import pick_device
 

@@ -15,6 +15,9 @@ from multiprocessing.reduction import ForkingPickler
 from pickle import PicklingError
 from typing import Any, TypeVar
 
+import threadpoolctl
+import torch
+
 from vd4rl_pomdp.core.errors import UserError, WorkerDiedError, first_line
 from vd4rl_pomdp.runs.interrupt import SIGNALS
 
@@ -114,9 +117,6 @@ def count_workers(workers: int) -> int:
 def _start_worker() -> None:
     """Set up a worker: one thread, and exit with the parent however that ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    import threadpoolctl
-    import torch
-
     # Otherwise every library starts one thread per core in each worker.
     torch.set_num_threads(1)
     threadpoolctl.threadpool_limits(1)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError
@@ -297,9 +298,7 @@ def _describe(
         name: {"dtype": str(values.dtype), "shape": [values[0].size], "names": None} for name, values in columns.items()
     }
     features[_OWN]["info"] = {"quality": source.quality}
-    from pandas import DataFrame, Index  # slow to load
-
-    DataFrame({"task_index": [0]}, index=Index([task], name="task")).to_parquet(folder / "meta" / "tasks.parquet")
+    pd.DataFrame({"task_index": [0]}, index=pd.Index([task], name="task")).to_parquet(folder / "meta" / "tasks.parquet")
     write_json(folder / "meta" / "stats.json", {name: _joined(index, f"stats/{name}/") for name in features})
     described = {
         "codebase_version": "v3.0",

@@ -15,6 +15,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from torch import nn
 
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.envs.maze import CELL_OFFSET, MazeEnv
@@ -199,7 +200,6 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
         from stable_baselines3.common.callbacks import BaseCallback
         from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.vec_env import DummyVecEnv
-        from torch import nn
     except ImportError as error:
         raise UserError(
             f"training a policy needs stable-baselines3 ({error}): `pip install '.[policy]'` in the package's folder"
