@@ -16,8 +16,7 @@ from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.nn.policy import Policy
-
-DIM, ACTIONS, SIZE = 3, 2, 32
+from vd4rl_pomdp.testing.algorithms import ACTIONS, DIM, SIZE, batch
 
 
 def make(kind: type, learning_rate: float = 1e-3) -> Algorithm:
@@ -27,15 +26,6 @@ def make(kind: type, learning_rate: float = 1e-3) -> Algorithm:
     policy = Policy(DIM, ACTIONS, 16)
     policy.standardise.fit(batch().z)
     return kind(policy, options, learning_rate, 40, RandomStream(torch.Generator().manual_seed(0)))
-
-
-def batch(seed: int = 0) -> FeatureBatch:
-    """Transitions of which every other one ends its episode for good."""
-    g = torch.Generator().manual_seed(seed)
-    z, next_z = (5 + 3 * torch.randn(SIZE, DIM, generator=g) for _ in range(2))
-    action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
-    reward, next_action = torch.randn(SIZE, generator=g), torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
-    return FeatureBatch(z, action, reward, torch.arange(SIZE) % 2 * 0.8, next_z, next_action)
 
 
 def test_drqv2s_noise_decays_linearly_and_then_stays():
