@@ -33,10 +33,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"
 CODE = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
 
 
-@pytest.fixture(autouse=True)
-def _cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture

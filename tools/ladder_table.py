@@ -141,16 +141,16 @@ def budget(cells: Sequence[Cell]) -> int | None:
     return min((rung for rung in rungs if all(cell.held_out[rung] <= NEAR * low for cell, low in pairs)), default=None)
 
 
-def cells_in(folder: Path = RESULTS) -> list[Cell]:
-    """Finished runs of a results folder with its curves.csv and cloning.csv, in grid order."""
+def cells_in() -> list[Cell]:
+    """Finished runs of results/ladder with its curves.csv and cloning.csv, in grid order."""
     known: defaultdict[str, dict[str, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
     for file, names in FILES.items():
-        with (folder / file).open(newline="") as rows:
+        with (RESULTS / file).open(newline="") as rows:
             for row in csv.DictReader(rows):
                 for column, name in names.items():
                     known[row["run"]][name][int(row["step"])] = float(row[column])
     cells = {}
-    for run in read_results(folder):
+    for run in read_results(RESULTS):
         if run.record["stage"] == "finetune" and run.finished:
             config = run.record["config"]
             card = run.card | {"corruption": run.card["corruption"]["corruption"]}

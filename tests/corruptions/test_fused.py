@@ -113,7 +113,7 @@ def test_what_cannot_be_compiled_runs_as_it_is_written_and_that_is_told_once(mon
 
     monkeypatch.setattr(torch, "compile", refuse)
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
-    double = hardware.compiled_on_gpu()(lambda x: 2 * x)
+    double = hardware.compiled_on_gpu(lambda x: 2 * x)
     assert [int(double(torch.tensor(3))) for _ in range(2)] == [6, 6]
     assert capsys.readouterr().err.count("is not compiled, which is slower: no compiler") == 1
 

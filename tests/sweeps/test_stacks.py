@@ -7,7 +7,7 @@ import pytest
 
 from tests.helpers_data import write_fake_set
 from tests.helpers_sweeps import begun, job, keep_plan, policy, until
-from tests.sweeps.test_driver import causes, code, command
+from tests.sweeps.test_driver import causes, code, command, quick  # noqa: F401 (a fixture for every test)
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import TEMPORARY
 from vd4rl_pomdp.nn.encoder import EncoderCard, EncoderConfig, EncoderRecord
@@ -18,12 +18,6 @@ from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver, in_stacks, width_of, words_of_stack
 from vd4rl_pomdp.sweeps.folder import SweepFolder, is_finished
 from vd4rl_pomdp.sweeps.options import LocalOptions
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    for name, seconds in {"POLL_S": 0.01, "PAUSE_S": 0.0, "IN_USE_S": 0.1, "IDLE_S": 0.5}.items():
-        monkeypatch.setattr(driver, name, seconds)
 
 
 def sweep(out, *jobs, at_once=1, stack=3, **options):

@@ -64,7 +64,7 @@ def drop_order(drop: Any, key: Tensor, stages: int, stack: int) -> Tensor:
     return drop.order(hash_keys(derive_keys(stages, key) ^ 1), stack)
 
 
-@compiled_on_gpu(training=True)
+@compiled_on_gpu
 def drawn(
     stages: tuple[Any, ...],
     drop: Any,
@@ -101,7 +101,7 @@ def drawn(
     return StackDraws(offset, kept, places)
 
 
-@compiled_on_gpu(training=True)
+@compiled_on_gpu
 def painted(
     stages: tuple[Any, ...],
     frames: Tensor,

@@ -81,14 +81,14 @@ class FrameEncoder(nn.Module):
 
 
 # functions, not methods: deepcopy of an encoder must not copy compiled code
-@compiled_on_gpu(training=True)
+@compiled_on_gpu
 def _maps(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
     pixels = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
     image = pixels.mul_(1 / 255).sub_(0.5)
     return encoder.convolutions(image).view(*obs.shape[:-3], *encoder.map_shape)
 
 
-@compiled_on_gpu(training=True)
+@compiled_on_gpu
 def _features(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
     return encoder.from_maps(_maps.__wrapped__(encoder, obs, dtype))
 

@@ -119,9 +119,9 @@ _COLUMNS: Columns = {
 }
 
 
-def print_comparison(comparison: SideBySide, console: Console | None = None) -> None:
+def print_comparison(comparison: SideBySide) -> None:
     """Print the comparison, one table per setting, with differing settings under the method's name."""
-    console = console or Console()
+    console = Console()
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side['others']} unfinished or diverged" if side["others"] else ""
         line = f"{name}: {side['path']}, {side['finished']} finished runs{others}"
