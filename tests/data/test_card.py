@@ -26,13 +26,13 @@ def test_a_card_says_what_the_set_holds_and_how_it_was_made(tmp_path):
     path = write_card(folder)
     returns = [sum(fake_reward(episode, t) for t in range(n - 1)) for episode, n in enumerate((12, 30, 12))]
     found = fields(path)
-    assert (found["episodes"], found["rows"], found["rows an episode"]) == ("3", "54", "12 to 30")
+    assert (found["episodes"], found["rows"], found["rows per episode"]) == ("3", "54", "12 to 30")
     assert found["return, mean"] == f"{np.mean(returns):.3f}"
     assert found["return, lowest to highest"] == f"{min(returns):.3f} to {max(returns):.3f}"
-    assert found["published return of plain BC on V-D4RL's set"] == "250"
+    assert found["published return of plain BC on V-D4RL's dataset"] == "250"
     assert (found["seed"], found["render"]) == ("7", "fast")
     assert found["actor medium_replay, SHA-256"] == "ab" * 32
-    assert "in proportion" in path.read_text()
+    assert "nearest to its place in the run" in path.read_text()
     with Image.open(folder / "card.png") as picture:
         assert picture.width > 600
 

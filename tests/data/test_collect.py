@@ -133,7 +133,7 @@ def test_medium_replay_follows_the_run_from_random_actions_to_the_medium_actor(t
     tops = [float(rung.weights["mean.weight"][0, 0]) for rung in ladder.rungs]
     assert acting == [None, tops[0], tops[1], tops[1], tops[2]]
     assert read_attributes(paths[0])["actor_sha256"] == "c" * 64
-    assert "regenerated from actors saved along the training run" in (tmp_path / "card.md").read_text()
+    assert "Regenerated from snapshots of the training run" in (tmp_path / "card.md").read_text()
 
 
 @pytest.mark.parametrize("quality", ["medium_replay", "medium_expert"])

@@ -136,13 +136,13 @@ def test_a_recording_that_reset_cuts_ends_by_truncation(minari, tmp_path):
 def test_minaris_jpeg_is_told(minari, tmp_path, capsys):
     record(minari, Screen(LAYOUTS["channels last"]))
     import_set("minari", "test/screen-v0", tmp_path / "set")
-    assert "its pictures are JPEG" in capsys.readouterr().err
+    assert "its images are JPEG" in capsys.readouterr().err
 
 
 def test_a_buffer_that_minari_kept_is_told(minari, tmp_path, capsys):
     record(minari, Screen(buffer=True))
     import_set("minari", "test/screen-v0", tmp_path / "set")
-    assert "in every episode all pictures are equal" in capsys.readouterr().err
+    assert "in every episode all images are equal" in capsys.readouterr().err
 
 
 def test_discrete_actions_become_columns(minari, tmp_path, capsys):
@@ -342,8 +342,8 @@ def test_published_64_pixel_sets_are_told_to_be_cut_short(tmp_path, capsys):
     export_set("vd4rl_npz", folder, place, size=64)
     import_set("vd4rl_npz", str(place), tmp_path / "set")
     told = capsys.readouterr().err
-    assert "the published 64-pixel sets are cut short" in told
-    assert "2 episodes of the expert alone" in told
+    assert "the published 64-pixel datasets are incomplete" in told
+    assert "2 episodes of the expert only" in told
     dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
     assert (dataset.task, dataset.quality, dataset.frame_size) == ("walker_walk", "medium_expert", 64)
 
@@ -354,7 +354,7 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     (tmp_path / "own").mkdir()
     write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk", "set": "expert"})
     import_set("vd4rl", str(tmp_path / "own"), tmp_path / "small", size=50)
-    assert "pictures of 84x84 pixels become 50x50 (area means)" in capsys.readouterr().err
+    assert "images of 84x84 pixels become 50x50 (area means)" in capsys.readouterr().err
     frames = rows_of_set(tmp_path / "small")["observation"]
     np.testing.assert_array_equal(
         frames, [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]
@@ -432,7 +432,7 @@ def test_a_recording_through_autoreset_is_told(minari, tmp_path, capsys):
         collector.step(collector.action_space.sample())
     collector.create_dataset("test/auto-v0")
     import_set("minari", "test/auto-v0", tmp_path / "set")
-    assert "every episode begins with the last picture of the one before" in capsys.readouterr().err
+    assert "every episode begins with the last image of the one before" in capsys.readouterr().err
 
 
 def test_the_environment_tells_the_task(minari, tmp_path, capsys):

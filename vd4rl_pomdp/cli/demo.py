@@ -92,7 +92,7 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
     policies = [(job.settings, job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
     yield f"Under {corruption}, errors of linear probes for pose and velocity (in % of a"
-    yield "standard deviation; 60 to 80 for an encoder that knows nothing), and returns"
+    yield "standard deviation; 60 to 80 for an uninformative encoder), and returns"
     yield "(mean ± standard error over episodes):"
     for settings, folder in policies:
         rows = read_episodes(folder / EPISODES_FILE)

@@ -30,19 +30,19 @@ LINES = 0.82
 """Relative height of bars and lines; the legend is above."""
 HOW = {
     "random": "Uniformly random actions.",
-    "medium": "The medium actor's sampled actions; the one that ships has about half of the expert's return.",
-    "expert": "The expert actor's sampled actions; the one that ships is the best snapshot of its training run.",
+    "medium": "The medium actor's sampled actions; the shipped one has about half of the expert's return.",
+    "expert": "The expert actor's sampled actions; the shipped one is the best snapshot of its training run.",
     "medium_expert": "The first half of the episodes by the expert actor, the second half by the medium actor.",
     "medium_replay": (
-        "Not a replay buffer itself, but regenerated from actors saved along the training run up to its medium level: "
-        "each episode is played anew, with the run's exploration noise, by the actor saved nearest to the moment of "
-        "the run that the episode stands for, in proportion and in order; the earliest by uniformly random actions."
+        "Regenerated from snapshots of the training run up to its medium level, instead of a replay buffer: each "
+        "episode is collected with the run's exploration noise by the snapshot nearest to its place in the run, in "
+        "order; the earliest by uniformly random actions."
     ),
-    "medium_noisy": "The medium actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
-    "expert_noisy": "The expert actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
+    "medium_noisy": "The medium actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's datasets.",
+    "expert_noisy": "The expert actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's datasets.",
     "medium_expert_noisy": (
         "The first half of the episodes by the expert actor, the second half by the medium actor, with Gaussian noise "
-        "added to their sampled actions. Not one of V-D4RL's sets."
+        "added to their sampled actions. Not one of V-D4RL's datasets."
     ),
 }
 
@@ -68,18 +68,18 @@ def write_card(path: Path) -> Path:
     table = {
         "episodes": len(returns),
         "rows": int(lengths.sum()),
-        "rows an episode": " to ".join(str(length) for length in dict.fromkeys([lengths.min(), lengths.max()])),
+        "rows per episode": " to ".join(str(length) for length in dict.fromkeys([lengths.min(), lengths.max()])),
         "return, mean": f"{returns.mean():.3f}",
         "return, standard deviation": f"{returns.std():.3f}",
         "return, lowest to highest": f"{returns.min():.3f} to {returns.max():.3f}",
         "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
-        "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
+        "published return of plain BC on V-D4RL's dataset": "none" if published is None else f"{published:.0f}",
     }
     memory = {f"memory under {one['name']}": certificate_in_words(one) for one in read_certificates([path]).values()}
     table |= memory or {"memory": NOT_CERTIFIED}
     lines = [f"| {name} | {markdown(str(value))} |" for name, value in table.items()]
     lines += [f"| {name} | {value} |" for name, value in _origin(path, attributes).items()]
-    how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
+    how = HOW.get(names[1] or "", "") if attributes[0] else "A published dataset, or one that records no origin."
     if source := dict(attributes[0].get("imported", {})):
         how = f"Imported from {source.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in source.items()))}."
     head = [f"# {markdown(title)}", "", how, "", "| | |", "|---|---|"]
@@ -110,9 +110,9 @@ def _picture(title: str, returns: np.ndarray, published: float | None, film: np.
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
     low, top = min(returns.min(), 0.0), max(returns.max(), published or 0.0, 1.0)
     counts, edges, _ = above.hist(returns, bins=np.linspace(low, top * 1.02, 41), color="#56b4e9")
-    above.axvline(returns.mean(), ymax=LINES, color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
+    above.axvline(returns.mean(), ymax=LINES, color="#0072b2", label=f"mean of this dataset, {returns.mean():.1f}")
     if published is not None:
-        label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
+        label = f"published: plain BC on V-D4RL's dataset of this name, {published:.0f}"
         above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
     above.set(xlabel="episode return", ylabel="episodes", title=plain(title))
     above.set(xlim=(edges[0], edges[-1]), ylim=(0, counts.max() / LINES))

@@ -199,9 +199,9 @@ class _Reader:
         if self._clipped:
             yield f"{self._clipped} actions lay outside their bounds and were clipped"
         if self._still and self._still == self._read:
-            yield "in every episode all pictures are equal: was a buffer recorded that the environment draws into?"
+            yield "in every episode all images are equal: did the recorder keep references to one buffer?"
         elif self._joined and self._joined == self._read - 1:
-            yield "every episode begins with the last picture of the one before: its first step crosses a reset"
+            yield "every episode begins with the last image of the one before: its first step crosses a reset"
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:
         """Actions rescaled to [-1, 1]; a first row's stays zero."""
@@ -240,7 +240,7 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
             yield rows | {FRAMES_KEY: np.stack(small)}
 
     stretched = "" if height == width else "; height and width are scaled separately"
-    note = f"pictures of {height}x{width} pixels become {size}x{size} (area means{stretched})"
+    note = f"images of {height}x{width} pixels become {size}x{size} (area means{stretched})"
     return replace(source, read=read, frame_shape=(size, size), notes=[*source.notes, note])
 
 

@@ -172,7 +172,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
             "",
             f"# {code(card.method)} on {code(card.task)}",
             "",
-            "An encoder of observations that are seen in part only, pretrained offline by `vd4rl-pomdp`.",
+            "An encoder of partial observations, pretrained offline by `vd4rl-pomdp`.",
             "",
             "| | |",
             "|---|---|",

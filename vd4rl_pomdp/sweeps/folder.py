@@ -220,7 +220,7 @@ def in_lines(found: Mapping[str, Any], out: Path) -> list[str]:
     left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
     return [
         f"{len(found['states'])} jobs: {counts}",
-        f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate",
+        f"{found['per_hour']:.1f} jobs per hour, {left} left at this rate",
         *(failure(row, out) for row in found["failures"].values()),
         *(f"running: {name}" for name, state in found["states"].items() if state == RUNNING),
     ]

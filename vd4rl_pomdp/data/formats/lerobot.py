@@ -150,13 +150,13 @@ def _survey(pq: Any, files: list[Path], outcomes: list[str]) -> tuple[np.ndarray
             lost += float(_dense(table["next.reward"].combine_chunks())[last].sum())
     if unused:
         rewards = f" and rewards ({lost:g} in all)" if "next.reward" in outcomes else ""
-        notes.append(f"the last actions{rewards} of {unused} episodes lead to no stored picture and are left out")
+        notes.append(f"the last actions{rewards} of {unused} episodes have no following image and are dropped")
     if "next.reward" not in outcomes:
         notes.append("it has no rewards: all are 0")
     low, high = np.min(lows, 0).astype(float), np.max(highs, 0).astype(float)
     if max(-low.min(), high.max()) <= 1:
         return None, None, notes
-    notes.append("LeRobot stores no bounds of actions: the least and the greatest of each dimension become -1 and 1")
+    notes.append("LeRobot stores no action bounds: each dimension's minimum and maximum become -1 and 1")
     still = low == high
     return np.where(still, low - 1, low), np.where(still, high + 1, high), notes
 

@@ -45,13 +45,11 @@ def read(source: str, picture: str | None) -> SourceSet:
     metadata, spec = json.loads(dataset.storage.metadata.get(_KEY, "{}")), dataset.env_spec
     notes = []
     if discrete:
-        notes.append(f"the {actions.n} discrete actions become as many columns: 1 for the one taken, -1 for the others")
+        notes.append(f"the {actions.n} discrete actions become one-hot columns: 1 for the one taken, -1 for the others")
     if storage.is_image_space(spaces[key]) and dataset.storage.jpeg_encoding:
-        notes.append(
-            "its pictures are JPEG, not what the environment drew; DataCollector(jpeg_encoding=False) keeps it"
-        )
+        notes.append("its images are JPEG, not the rendered ones; DataCollector(jpeg_encoding=False) keeps those")
     if spec and spec.kwargs.get("corruption", "none") != "none":
-        notes.append(f"its pictures were recorded under the corruption {spec.kwargs['corruption']}")
+        notes.append(f"its images were recorded under the corruption {spec.kwargs['corruption']}")
     lengths = [int(one["total_steps"]) for one in dataset.storage.get_episode_metadata(dataset.episode_indices)]
 
     def episode(number: int) -> EpisodeArrays:

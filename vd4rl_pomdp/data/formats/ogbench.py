@@ -55,7 +55,7 @@ def read(source: str, picture: str | None) -> SourceSet:
         size,
         episodes,
         {"file": path.name.removesuffix(".npz"), "bytes": path.stat().st_size},
-        notes=["it has no rewards, as goals give them: all are 0"],
+        notes=["it has no rewards, since goals define them: all are 0"],
     )
 
 

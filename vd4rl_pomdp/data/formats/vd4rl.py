@@ -59,10 +59,10 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
     rows = sum(int(length[1]) if length else shape[0] for length in lengths)
     (task, quality), notes = task_and_quality(folder, []), []
     if "64px" in folder.resolve().parts and len(files) <= 100 and task and quality:  # V-D4RL's paper states more
-        expert = " of the expert alone" if quality == "medium_expert" else ""
+        expert = " of the expert only" if quality == "medium_expert" else ""
         notes = [
-            f"the published 64-pixel sets are cut short: {folder} has {len(files)} episodes{expert}, the 84-pixel one "
-            f"all: `vd4rl-pomdp data download --task {task} --quality {quality}`, then `data import vd4rl SET OUT "
+            f"the published 64-pixel datasets are incomplete: {folder} has {len(files)} episodes{expert}, the 84-pixel "
+            f"one all: `vd4rl-pomdp data download --task {task} --quality {quality}`, then `data import vd4rl SET OUT "
             "--size 64`"
         ]
     record = {"folder": folder.resolve().name, "bytes": sum(file.stat().st_size for file in files)}
