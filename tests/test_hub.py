@@ -176,7 +176,7 @@ def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder
     repo.commit("main", {"pytorch_model.bin": b"pickle", "README.md": b""})
     with pytest.raises(UserError, match=r"lab/encoder: holds files that were not pushed by vd4rl-pomdp; choose"):
         push(encoder, ENCODER, revision="v1")
-    with pytest.raises(UserError, match=r"lab/encoder: the Hub refuses"):
+    with pytest.raises(UserError, match=r"lab/encoder: the Hub refused"):
         pull(ENCODER, tmp_path / "new")
     assert set(hub.files(WHERE[ENCODER])) == {"pytorch_model.bin", "README.md"}
     assert set(repo.branches) == {"main"}
@@ -280,4 +280,4 @@ def test_the_commands_of_the_program(hub, encoder, tmp_path, capsys):
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith("error: lab/nothing: the Hub refuses")
+    assert err.startswith("error: lab/nothing: the Hub refused")

@@ -106,7 +106,9 @@ def test_an_example_keeps_the_promises_of_its_kind(load, kind):
 
 def test_a_wrong_claim_of_the_example_is_caught(load):
     load("method").PastToFrame.visible = lambda self, t, k, rows: ({t, t + k}, set())
-    with pytest.raises(AssertionError, match=r"method 'past_to_frame' breaks a promise(.|\n)*is declared to see rows"):
+    with pytest.raises(
+        AssertionError, match=r"method 'past_to_frame' violates its contract(.|\n)*is declared to see rows"
+    ):
         testing.check_method("past_to_frame")
 
 

@@ -32,7 +32,7 @@ def stacks(n: int = 64) -> torch.Tensor:
     [
         (
             CorruptionConfig(corruption="patch+zero_frames"),
-            r"make it by CorruptionConfig.of\('patch\+zero_frames', ...\)",
+            r"create it with CorruptionConfig.of\('patch\+zero_frames', ...\)",
         ),
         (
             CorruptionConfig("patch", "emision", (Patch(),)),

@@ -64,7 +64,9 @@ def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
     shard.unlink()
     with monkeypatch.context() as patch:
         patch.setattr(parity, "render_info", lambda task: info | {"canary": "other", "gl_renderer": "another GPU"})
-        with pytest.raises(UserError, match=r"its shards were rendered by .*, and another GPU renders other pixels"):
+        with pytest.raises(
+            UserError, match=r"its shards were rendered by .*, and another GPU renders different pixels"
+        ):
             collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
     assert not shard.exists()
     collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)

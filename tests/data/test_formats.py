@@ -150,7 +150,7 @@ def test_discrete_actions_become_columns(minari, tmp_path, capsys):
     import_set("minari", "test/screen-v0", tmp_path / "set")
     action = rows_of_set(tmp_path / "set")["action"].reshape(2, 7, 4)[:, 1:].reshape(-1, 4)
     np.testing.assert_array_equal(action, np.where(np.arange(1, 5) == taken[:, None], 1, -1))
-    assert "the 4 discrete actions become as many columns" in capsys.readouterr().err
+    assert "the 4 discrete actions become one-hot columns" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_a_set_without_a_last_picture_is_read_up_to_there(exported, tmp_path, ca
     as_others_write(out, scale=100)
     import_set("lerobot", str(out), tmp_path / "back")
     told = capsys.readouterr().err
-    assert "rewards (3.048 in all) of 3 episodes lead to no stored picture" in told
+    assert "rewards (3.048 in all) of 3 episodes have no following image" in told
     assert "each dimension's minimum and maximum become -1 and 1" in told
     rows, given = rows_of_set(tmp_path / "back"), rows_of_set(own)
     kept = np.concatenate([np.arange(19), 20 + np.arange(24), 45 + np.arange(8)])

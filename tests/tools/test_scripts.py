@@ -49,5 +49,7 @@ def test_a_table_takes_the_place_of_the_one_under_its_mark(monkeypatch):
     page = "a\n\n<!-- table: one -->\n| old |\n| older |\n\n| not it |\n<!-- table: other -->\nend"
     written = script.with_tables(page, {"other": ["| 2 |"], "one": ["| 1 |"]}, "page.md")
     assert written == "a\n\n<!-- table: one -->\n| 1 |\n\n| not it |\n<!-- table: other -->\n| 2 |\nend"
-    with pytest.raises(UserError, match=r"^page.md: one line `<!-- table: new -->` is wanted, .* belongs; 0 found$"):
+    with pytest.raises(
+        UserError, match=r"^page.md: expected one line `<!-- table: new -->` above that table, found 0$"
+    ):
         script.with_tables(page, {"new": ["| 3 |"]}, "page.md")
