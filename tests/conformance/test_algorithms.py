@@ -165,7 +165,7 @@ def algorithms():
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
 def test_an_algorithm_that_breaks_a_promise_is_told_which_and_how(algorithms, kind, check, reason):
     algorithms.register("mine", kind)
-    with pytest.raises(AssertionError, match=f"algorithm 'mine' breaks a promise(.|\n)*{reason}"):
+    with pytest.raises(AssertionError, match=f"algorithm 'mine' violates its contract(.|\n)*{reason}"):
         run_check("algorithm", check, "mine")
 
 

@@ -159,7 +159,7 @@ def test_a_stage_that_does_something_else_than_the_one_it_inherits_from_is_calle
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
 def test_a_corruption_that_breaks_a_promise_is_told_which_and_how(stages, kind, check, reason):
     stages.register("mine", kind)
-    with pytest.raises(AssertionError, match=f"corruption 'mine' breaks a promise(.|\n)*{reason}"):
+    with pytest.raises(AssertionError, match=f"corruption 'mine' violates its contract(.|\n)*{reason}"):
         run_check("corruption", check, "mine")
 
 

@@ -103,7 +103,7 @@ def encoders():
 @pytest.mark.parametrize(("layer", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
 def test_a_frame_encoder_that_breaks_a_promise_is_told_which_and_how(encoders, layer, check, reason):
     encoders.register("mine", FrameEncoderPart(with_layer(layer)))
-    with pytest.raises(AssertionError, match=f"frame encoder 'mine' breaks a promise(.|\n)*{reason}"):
+    with pytest.raises(AssertionError, match=f"frame encoder 'mine' violates its contract(.|\n)*{reason}"):
         run_check("frame encoder", check, "mine", size=SIZE)
 
 

@@ -127,7 +127,7 @@ class Hidden(GRU):
 )
 def test_a_memory_that_breaks_a_promise_is_told_which_and_how(memories, kind, check, reason):
     memories.register("mine", MemoryPart(kind, GRUOptions))
-    with pytest.raises(AssertionError, match=f"memory 'mine' breaks a promise(.|\n)*{reason}"):
+    with pytest.raises(AssertionError, match=f"memory 'mine' violates its contract(.|\n)*{reason}"):
         run_check("memory", check, "mine")
 
 

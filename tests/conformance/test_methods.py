@@ -174,7 +174,7 @@ def methods():
 def test_a_method_that_breaks_a_promise_is_told_which_and_how(methods, kind, check, reason):
     options = {"options": InverseOptions} if issubclass(kind, StateInverse) else {}
     methods.register("mine", Method(kind, **options))
-    with pytest.raises(AssertionError, match=f"method 'mine' breaks a promise(.|\n)*{reason}"):
+    with pytest.raises(AssertionError, match=f"method 'mine' violates its contract(.|\n)*{reason}"):
         run_check("method", check, "mine")
 
 

@@ -98,7 +98,7 @@ MUTANTS = [
 @pytest.mark.parametrize(("task", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
 def test_a_task_that_breaks_a_promise_is_told_which_and_how(tasks, task, check, reason):
     tasks.register("mine", task)
-    with pytest.raises(AssertionError, match=f"task 'mine' breaks a promise(.|\n)*{reason}"):
+    with pytest.raises(AssertionError, match=f"task 'mine' violates its contract(.|\n)*{reason}"):
         run_check("task", check, "mine")
 
 

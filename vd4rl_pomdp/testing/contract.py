@@ -1,4 +1,4 @@
-"""Helpers shared by all conformance checks: run checks and report broken promises."""
+"""Helpers shared by all conformance checks: run checks and report violated contracts."""
 
 from __future__ import annotations
 
