@@ -137,6 +137,7 @@ def test_a_certificate_follows_from_the_intervals_of_both_differences():
     assert verdict(0.4, -0.3) == NEEDS_NOT
     assert verdict(0.4, 0.0, level=0.45) == OPEN, "it knows little itself: for want of budget?"
     assert verdict(0.4, 0.3, level=0.45) == NEEDS
+    assert verdict(0.4, 0.3, level=-0.1) == OPEN, "worse than the mean, but above overfitted probes of noise"
     assert verdict(0.4, 0.1, spread=1) == OPEN
     assert verdict(0.4, 0.3, seeds=1) == OPEN
 

@@ -8,7 +8,7 @@ The grid `certify` trains on the simulator's states, with:
     state                 the state itself: whether data and budget suffice
 
 Each is scored by R^2 of the states in episodes held out from encoder and probe, and optionally by the returns of a
-policy. Such a memory is needed if the first scores above the second and the third.
+policy. Such a memory is needed if the first scores above the second, the third and 0 (R^2 of predicting the mean).
 """
 
 from __future__ import annotations
@@ -180,10 +180,12 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
         above[floor] = (float(values[MEMORY].mean() - values[floor].mean()), *ends)
     known = all(low is not None for _, low, _ in above.values())
     weak = methods[MEMORY][0] < ENOUGH * unit
-    verdict = NEEDS if known and all(low > 0 for _, low, _ in above.values()) else OPEN
+    mean, low, high = methods[MEMORY]
+    # a floor below 0, R^2 of the mean, shows an overfitted probe: to be above it is not enough
+    least = (low, *(low for _, low, _ in above.values()))
+    verdict = NEEDS if known and all(end is not None and end > 0 for end in least) else OPEN
     if known and any(high < MARGIN * unit for *_, high in above.values()):
         verdict = OPEN if weak else NEEDS_NOT
-    mean, low, high = methods[MEMORY]
     why = [f"{MEMORY} {with_interval(mean, low, high, digits)}"]
     why += [f"less {floor} {with_interval(mean, low, high, digits)}" for floor, (mean, low, high) in above.items()]
     why += ["too few seeds"] * (not known) + ["itself too low to judge"] * (weak and verdict == OPEN)
