@@ -159,9 +159,9 @@ def check_names(config: object) -> None:
     """Names that a command looks up after parsing must exist."""
     if type(config).__name__ == "NavigationConfig":  # their methods are others, too
         return
-    told = config.keywords if isinstance(config, functools.partial) else vars(config)
+    values = config.keywords if isinstance(config, functools.partial) else vars(config)
     for field, check in CHECKS.items():
-        value = told.get(field)
+        value = values.get(field)
         for name in value if isinstance(value, list | tuple) else [value]:
             if name:
                 check(name)

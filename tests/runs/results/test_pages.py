@@ -1,4 +1,4 @@
-"""Means with intervals or standard errors that the pages tell in sentences are those of committed rows."""
+"""Means with intervals or standard errors that the pages quote in sentences are those of committed rows."""
 
 import importlib
 import itertools
@@ -21,7 +21,7 @@ from vd4rl_pomdp.studies.navigation.report import write_report
 from vd4rl_pomdp.studies.navigation.runs import online_error, refitted_error
 
 ROOT = Path(__file__).parents[3]
-TOLD = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?|[-+]?\d+(?: more| less| above it)? \[-?\d+, -?\d+\]")
+QUOTED = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?|[-+]?\d+(?: more| less| above it)? \[-?\d+, -?\d+\]")
 GENERATED = re.compile(r"<!-- table: .* -->\n(?:\|.*\n)*")
 """Tables that scripts write, which tests/tools/test_scripts.py holds against rows."""
 MAIN = ("control", "offline")
@@ -43,16 +43,16 @@ def estimate(numbers: Iterable[float]) -> Estimate | None:
     return (found.mean(), found.std(ddof=1) / math.sqrt(len(found))) if len(found) > 1 else None
 
 
-def told(one: Estimate, digits: int) -> str:
+def quoted(one: Estimate, digits: int) -> str:
     return f"{one[0]:.{digits}f} ± {one[1]:.{digits}f}"
 
 
 def with_differences(estimates: Iterable[Estimate | None], digits: int) -> Iterator[str]:
     """Estimates that can be compared, and every difference of two."""
     known = [one for one in estimates if one]
-    yield from (told(one, digits) for one in known)
+    yield from (quoted(one, digits) for one in known)
     for one, other in itertools.permutations(known, 2):
-        yield told((one[0] - other[0], math.hypot(one[1], other[1])), digits)
+        yield quoted((one[0] - other[0], math.hypot(one[1], other[1])), digits)
 
 
 def of_returns(folders: Iterable[str]) -> Iterator[str]:
@@ -62,7 +62,7 @@ def of_returns(folders: Iterable[str]) -> Iterator[str]:
         if run.rows and run.finished:
             kind = run.labels["corruption"], run.labels["algorithm"], run.method, run.variant
             groups[run.set_name][kind].append(run)
-            yield told(estimate(row["return"] for row in run.last), 0)
+            yield quoted(estimate(row["return"] for row in run.last), 0)
     for methods in groups.values():
         everyone = list(methods.values())
         yield from intervals([episodes_of(mine) for mine in everyone])
@@ -121,9 +121,9 @@ def known() -> set[str]:
 
 
 def unknown(text: str, known: set[str]) -> list[str]:
-    """What is told and in no row; words may stand between a difference and its interval."""
+    """What is quoted and in no row; words may stand between a difference and its interval."""
     return [
-        found for found in TOLD.findall(text) if re.sub(r" (more|less|above it)", "", found).lstrip("+") not in known
+        found for found in QUOTED.findall(text) if re.sub(r" (more|less|above it)", "", found).lstrip("+") not in known
     ]
 
 
@@ -142,7 +142,7 @@ def unknown(text: str, known: set[str]) -> list[str]:
 )
 def test_what_a_page_tells_is_in_the_rows(page, least, known):
     text = GENERATED.sub("", (ROOT / page).read_text(encoding="utf-8"))
-    assert len(TOLD.findall(text)) >= least
+    assert len(QUOTED.findall(text)) >= least
     assert unknown(text, known) == []
 
 
@@ -150,7 +150,7 @@ def test_what_a_page_tells_is_in_the_rows(page, least, known):
     "text", ["`mik+a` returns 521 [321, 720]", "`mik` less `acro` +180 [106, 253]", "by 5.15 ± 0.11"]
 )
 def test_what_no_row_says_is_found(text, known):
-    assert unknown(text, known) == TOLD.findall(text)
+    assert unknown(text, known) == QUOTED.findall(text)
 
 
 @pytest.mark.parametrize("place", REPORTS, ids=lambda place: place.name)
