@@ -97,10 +97,9 @@ def return_lines(runs: Sequence[Run]) -> Iterator[str]:
     rows = []
     for place, corruption, here in _measured_sets(runs):
         cells = [_mean_text(_of(here, method, corruption)) for method in MAIN]
-        cells += [_difference(here, corruption, "mik+a", "acro", clean) for clean in (False, True)]
         name = f"{SETS[place]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
         rows.append((name + ", exploratory" * (place[1] in EXPLORATORY), *cells, _mean_text(_of(here, "acro", CLEAN))))
-    head = (*(f"`{name}`" for name in MAIN), "`mik+a` minus `acro`", "the same, evaluated clean")
+    head = (f"`{name}`" for name in MAIN)
     return table_lines(("set (data's return)", *head, "`acro` trained with nothing hidden"), rows)
 
 

@@ -113,18 +113,18 @@ def facts() -> list[Row]:
     informative = f"{third['pairs'] - third['uniform']} of {third['pairs']}"
     found: list[tuple[str, str, list[tuple[str, str, str, str]]]] = [
         (
-            "A forward jump looks back behind m",
+            "The window of a forward jump reaches m rows back",
             f"P(a_t | rows t-m..t and t+k-m..t+k) is {INVERSE} for every k > m (section 3.1)",
             [_prediction(world, "fj+a", least_memory(world).m + 1) for world in (tiny("ladder"), theirs)],
         ),
         (
-            "Jumps beyond m are not useless to FJ+A",
+            "FJ+A can learn from jumps beyond m",
             "on the counterexample k > m = 3 gives no signal, so that FJ and FJ+A fail (section 3.2)",
             [_jumps(theirs)],
         ),
         (
             "Without the leak, the counterexample breaks an assumption of MIK+A",
-            "the counterexample sets MIK+A apart from FJ and FJ+A (section 3.2); MIK+A assumes that the future decodes "
+            "the counterexample separates MIK+A from FJ and FJ+A (section 3.2); MIK+A assumes that the future decodes "
             "(Table 1)",
             [_prediction(world, "mik+a", 1) for world in (tiny("hidden switch"), theirs)],
         ),
@@ -153,12 +153,12 @@ def facts() -> list[Row]:
             [_prediction(world, "mik+a literal", 2) for world in (tiny("toggle"), momentum())],
         ),
         (
-            "MIK+A's past encoder may merge states that act alike",
+            "MIK+A's past encoder may merge states with the same successors",
             "MIK+A finds the complete agent-centric state (Table 1, section 3.2)",
             [_merged(world) for world in (tiny("switch"), echo())],
         ),
         (
-            "Where states take turns, no inverse model distinguishes the turns",
+            "In periodic worlds no inverse model distinguishes the phases",
             "all k up to the diameter recover the state of a deterministic world (appendix), and k = 1 to 3 that of "
             "the counterexample (section 3.2)",
             [_codes(world) for world in (tiny("alternator"), theirs)],
