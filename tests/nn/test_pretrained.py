@@ -103,6 +103,15 @@ SHAPE = {
 }  # fmt: skip
 
 
+def test_a_size_of_no_whole_patches_is_refused_as_the_border_would_be_unseen(model: Path):
+    with pytest.raises(
+        UserError, match=r"ignores the last rows and columns of images of 40x40 pixels: choose a --model"
+    ):
+        make("pretrained", model=str(model), model_size=40)
+    told = make("pretrained", model=str(model), model_size=SIZE).frame.found["weights"]
+    make("pretrained", model=str(model), model_size=40, weights=told)  # of an encoder that exists
+
+
 def test_features_never_come_from_weights_that_the_file_lacks(tmp_path: Path):
     transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
     transformers.ViTForImageClassification(transformers.ViTConfig(**SHAPE)).save_pretrained(tmp_path / "vit")

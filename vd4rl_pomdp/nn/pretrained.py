@@ -42,7 +42,8 @@ class Pretrained(nn.Module):
 
         Raises:
             UserError: transformers or the model is missing, its weights differ or are incomplete, it cannot encode
-                images of this size or is random, or channels is not a multiple of 3.
+                images of this size, is random, or ignores their border (only where any weights may be loaded), or
+                channels is not a multiple of 3.
         """
         super().__init__()
         if channels % 3:
@@ -60,9 +61,10 @@ class Pretrained(nn.Module):
         self.size, self.found = size, {"weights": found}
         self.register_buffer("mean", mean, persistent=False)
         self.register_buffer("std", std, persistent=False)
-        ramp = torch.linspace(-0.5, 0.5, channels * size * size).view(1, channels, size, size)
+        ramp = torch.linspace(-0.5, 0.5, channels * size * size).view(1, channels, size, size).requires_grad_()
         try:
-            first, again = self(ramp), self(ramp)
+            with torch.enable_grad():
+                first, again = self(ramp), self(ramp)
         except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise UserError(
                 f"--model {name}: cannot encode images of {size}x{size} pixels ({first_line(error)}): choose another "
@@ -70,6 +72,8 @@ class Pretrained(nn.Module):
             ) from error
         if not torch.equal(first, again):  # such as MAE, which masks patches at random
             raise UserError(f"--model {name}: its features of one image differ between calls: choose another model")
+        if not weights:  # an encoder that was trained on what the model sees stays usable
+            _check_border(name, ramp, first)
 
     def forward(self, image: Tensor) -> Tensor:
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
@@ -125,6 +129,17 @@ def _statistics(name: str) -> tuple[Tensor, Tensor]:
         stated = read_json(Path(cached_file(name, "preprocessor_config.json", local_files_only=True)))
     mean, std = stated.get("image_mean", MEAN), stated.get("image_std", STD)
     return torch.tensor(mean).expand(3)[:, None, None], torch.tensor(std).expand(3)[:, None, None]
+
+
+def _check_border(name: str, images: Tensor, features: Tensor) -> None:
+    """Refuse a model that drops the last rows and columns, as ViTs do with those that fill no whole patch."""
+    (gradient,) = torch.autograd.grad(features.flatten().dot(torch.linspace(-1, 1, features.numel())), images)
+    if not (gradient[..., -1, :].any() and gradient[..., :, -1].any()):
+        size = images.shape[-1]
+        raise UserError(
+            f"--model {name}: ignores the last rows and columns of images of {size}x{size} pixels: choose a "
+            "--model-size that is a multiple of the model's patch size"
+        )
 
 
 def _content(tensors: Mapping[str, Tensor]) -> str:
