@@ -52,7 +52,10 @@ def test_a_call_adds_a_part_and_after_a_block_it_is_forgotten(registry):
         ("own", "mine", "a frame encoder called 'own' exists already"),
         ("three", 3, "frame encoder 'three' is a int, not a string"),
         ("a", "yours", "frame encoder 'a': it is yours: choose mine"),
-        *((name, "mine", f"frame encoder '{name}': folders and") for name in ("", "..", "a,b", "x/y", "my own", "a=b")),
+        *(
+            (name, "mine", f"frame encoder '{name}': names are part of paths")
+            for name in ("", "..", "a,b", "x/y", "my own", "a=b")
+        ),
     ],
 )
 def test_what_cannot_be_a_part_is_refused_however_it_comes(registry, monkeypatch, capsys, name, part, told):

@@ -218,7 +218,7 @@ def test_a_collected_set_that_lacks_episodes_is_refused(tmp_path, cache, unit):
     [
         ({"action_dim": 5, "physics_dim": 3}, r"0_b\.hdf5: 'action' has 5 dimensions, in 0_a\.hdf5 6"),
         ({"physics_dim": 4}, r"0_b\.hdf5: 'physics' has 4 dimensions, in 0_a\.hdf5 3"),
-        ({}, r"0_a\.hdf5: has 'physics', 0_b\.hdf5 has not"),
+        ({}, r"0_a\.hdf5: has 'physics' and 0_b\.hdf5 does not"),
     ],
 )
 def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):

@@ -78,7 +78,7 @@ def test_a_failed_sweep_ends_with_each_failure_in_a_line_and_what_to_do(tmp_path
     told = capsys.readouterr()
     assert told.err.splitlines()[-1] == f"failed: bad: its last line (see {tmp_path}/sweep/logs/bad.log)"
     program = tmp_path / "program.py"
-    line = f"1 of 1 jobs are not finished, 1 failed; `python {program} sweep retry {tmp_path}` takes those up again\n"
+    line = f"1 of 1 jobs are not finished, 1 failed; `python {program} sweep retry {tmp_path}` retries them\n"
     assert told.out == line
     main(["sweep", "status", str(tmp_path)])
     assert "1 jobs: 1 failed\n" in capsys.readouterr().out

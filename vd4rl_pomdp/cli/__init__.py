@@ -93,13 +93,10 @@ def run_to_end(words: Sequence[str]) -> End:
         for word in words:
             word.encode()  # names and paths are written to UTF-8 files
         with interrupt.handled(second):
-            name = next((n for n in (" ".join(words[:2]), *words[:1]) if n in COMMANDS), None)
-            if name is None:
-                _show_commands(list(words))
-            else:
-                module, _, function = COMMANDS[name][0].partition(".")
-                command = getattr(importlib.import_module(f"{__name__}.{module}"), function)
-                command(list(words[len(name.split()) :]), f"{PROGRAM} {name}")
+            try:
+                _run(list(words))
+            finally:
+                sys.stdout.flush()  # here, where a closed pipe is handled; --help ends in SystemExit
     except UserError as error:
         return End(error.code, f"error: {in_one_line(error)}")
     except UnicodeEncodeError as error:
@@ -111,6 +108,7 @@ def run_to_end(words: Sequence[str]) -> End:
         where = getattr(error, "reason", str(error))
         return End(code, f"{how}: {where}{'; ' if where else ''}re-run the same command to resume")
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
         return End(141)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
@@ -121,6 +119,16 @@ def run_to_end(words: Sequence[str]) -> End:
         named = disk_error(error.filename, error)
         return End(named.code, f"error: {named}")
     return End()
+
+
+def _run(words: list[str]) -> None:
+    name = next((n for n in (" ".join(words[:2]), *words[:1]) if n in COMMANDS), None)
+    if name is None:
+        _show_commands(words)
+    else:
+        module, _, function = COMMANDS[name][0].partition(".")
+        command = getattr(importlib.import_module(f"{__name__}.{module}"), function)
+        command(words[len(name.split()) :], f"{PROGRAM} {name}")
 
 
 def _show_commands(words: list[str]) -> None:
