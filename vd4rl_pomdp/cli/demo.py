@@ -14,7 +14,7 @@ from pathlib import Path
 
 from vd4rl_pomdp.cli.hub import play
 from vd4rl_pomdp.cli.parsing import command
-from vd4rl_pomdp.cli.studies import report
+from vd4rl_pomdp.cli.report import report
 from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.envs.mazes import get_maze
