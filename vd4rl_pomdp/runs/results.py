@@ -126,7 +126,7 @@ class Result:
 
     @cached_property
     def experiment(self) -> str:
-        """The same for all of its seeds."""
+        """Hash like `recipe`, the same for all seeds of an experiment."""
         return recipe(self.record, self._settings_card, seeds=False)
 
     @property
