@@ -21,7 +21,7 @@ def fields(path):
     return {line[0]: line[1] for line in lines if len(line) == 2}
 
 
-def test_a_card_says_what_the_set_holds_and_how_it_was_made(tmp_path):
+def test_card_lists_contents_and_origin(tmp_path):
     folder = write_fake_set(tmp_path / "set", (12, 30, 12), attributes=MADE | {"actor_sha256": "ab" * 32})
     path = write_card(folder)
     returns = [sum(fake_reward(episode, t) for t in range(n - 1)) for episode, n in enumerate((12, 30, 12))]
@@ -37,7 +37,7 @@ def test_a_card_says_what_the_set_holds_and_how_it_was_made(tmp_path):
         assert picture.width > 600
 
 
-def test_the_film_shows_the_episode_of_median_return_across_shards(tmp_path):
+def test_film_shows_episode_of_median_return(tmp_path):
     folder = write_fake_set(tmp_path / "set", (12, 30, 20), cuts=(40, 50), attributes=MADE)
     shards = module.shard_paths(folder)
     counts = [40, 10, 12]
@@ -47,7 +47,7 @@ def test_the_film_shows_the_episode_of_median_return_across_shards(tmp_path):
     assert film[:, 2, 0, 0].tolist() == np.linspace(0, 19, module.FILM_FRAMES).astype(int).tolist()
 
 
-def test_a_published_set_gets_a_card_without_an_origin(tmp_path):
+def test_card_of_published_set_has_no_origin(tmp_path):
     folder = write_fake_set(tmp_path / "walker_walk" / "expert" / "84px")
     text = write_card(folder).read_text()
     assert text.startswith("# walker_walk, expert")
@@ -55,21 +55,21 @@ def test_a_published_set_gets_a_card_without_an_origin(tmp_path):
     assert "seed" not in text
 
 
-def test_one_shard_of_a_set_gets_no_card(tmp_path):
+def test_card_of_single_shard_is_rejected(tmp_path):
     folder = write_fake_set(tmp_path / "set", (12, 30, 20), cuts=(40, 50))
     with pytest.raises(UserError, match="describes a whole dataset"):
         write_card(module.shard_paths(folder)[0])
     assert not list(folder.glob("card.*"))
 
 
-def test_every_set_of_the_benchmark_has_a_published_score():
+def test_published_scores_cover_all_benchmark_sets():
     assert {(row["env"], row["dataset"]) for row in published_scores()} == {
         (t, q) for t in ("walker_walk", "cheetah_run", "humanoid_walk") for q in QUALITIES
     }
     assert set(module.HOW) == set(SET_QUALITIES)
 
 
-def test_a_card_shows_names_as_they_are_whatever_they_hold(tmp_path):
+def test_card_escapes_markup_in_names(tmp_path):
     hostile = "$\\frac$ | `a` <img src=x>\n# b"
     folder = write_fake_set(tmp_path / "set", attributes=MADE | {"set": hostile, "policy": "a|b", "actor_sha256": "f0"})
     record = {"command": f"vd4rl-pomdp --out 'x|`y`\n{hostile}'", "git_commit": "<b>", "versions": {"torch": "2|3"}}
@@ -79,5 +79,5 @@ def test_a_card_shows_names_as_they_are_whatever_they_hold(tmp_path):
     rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
     assert all(len(re.findall(r"(?<!\\)\|", row)) == 3 for row in rows), "two cells a row"
     assert "<b>" not in text
-    assert "<img" not in re.sub("(`+) .*? \\1", "", text), "outside of the command, which is code"
+    assert "<img" not in re.sub("(`+) .*? \\1", "", text), "only in the command, which is code"
     assert (folder / "card.png").stat().st_size > 5_000

@@ -11,7 +11,7 @@ from vd4rl_pomdp.envs import dmc
 
 
 def true_replay(task, physics, actions):
-    """Rewards of the fake sets, told from their fake simulator state and actions."""
+    """Rewards of the fake sets, computed from their fake physics and actions."""
     assert task == "walker_walk"
     episode, t = int(physics[0]), int(physics[1])
     assert t == 0, "a replay starts at an episode's first row"
@@ -26,7 +26,7 @@ def folder(tmp_path, monkeypatch):
     return write_fake_set(tmp_path / "walker_walk" / "expert", lengths, physics_dim=3, cuts=(3, 7), complete_last=False)
 
 
-def test_the_report_holds_every_number(folder, tmp_path):
+def test_check_reports_counts_returns_and_dtypes(folder, tmp_path):
     report = check_dataset(folder, tmp_path / "cache")
     shards = [f"{i}_fake.hdf5" for i in range(3)]
     dtypes = {"observation": ["uint8"], "action": ["float32"], "reward": ["float64"], "discount": ["float64"]}
@@ -53,19 +53,19 @@ def test_the_report_holds_every_number(folder, tmp_path):
     }
 
 
-def test_the_largest_replay_error_counts(folder, tmp_path):
+def test_check_reports_largest_replay_error(folder, tmp_path):
     with h5py.File(folder / "2_fake.hdf5", "a") as file:
         file["reward"][1] += 0.25
     assert check_dataset(folder, tmp_path / "cache")["replay_max_error"] == pytest.approx(0.25)
 
 
-def test_a_replay_that_gives_no_number_is_not_exact(folder, tmp_path, monkeypatch):
+def test_nan_replay_is_reported_as_nan(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(dmc, "replay_rewards", lambda *arguments: true_replay(*arguments) * np.nan)
     assert np.isnan(check_dataset(folder, tmp_path / "cache")["replay_max_error"])
 
 
 @pytest.mark.parametrize(
-    ("row", "key", "value", "told"),
+    ("row", "key", "value", "message"),
     [
         (0, "action", 0.5, "an episode's first row has a nonzero action or reward"),
         (0, "reward", 0.5, "an episode's first row has a nonzero action or reward"),
@@ -74,17 +74,17 @@ def test_a_replay_that_gives_no_number_is_not_exact(folder, tmp_path, monkeypatc
         (1, "action", -1.5, r"has actions of up to 1.5: scale them to \[-1, 1\]"),
     ],
 )
-def test_what_can_be_no_action_is_refused(tmp_path, row, key, value, told):
+def test_invalid_actions_rewards_and_discounts_are_rejected(tmp_path, row, key, value, message):
     folder = write_fake_set(tmp_path / "walker_walk" / "expert", (5, 4))
     with h5py.File(next(folder.glob("0_*.hdf5")), "a") as file:
         file[key][row] = value
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         check_dataset(folder, tmp_path / "cache")
 
 
 @pytest.mark.parametrize(("action_dim", "physics"), [(6, 0.0), (4, 0.0), (6, 1e30)])
-def test_states_and_actions_of_another_simulator_are_one_line(tmp_path, action_dim, physics):
-    """A state too narrow, an action too narrow, a state that no simulator survives."""
+def test_physics_of_another_simulator_is_rejected(tmp_path, action_dim, physics):
+    """Too few state dimensions, too few action dimensions, and a state that makes the simulation diverge."""
     width = 18 if action_dim == 4 or physics else 5
     folder = write_fake_set(tmp_path / "walker_walk", (4,), action_dim=action_dim, physics_dim=width)
     if physics:

@@ -25,7 +25,7 @@ def config(out, **changes):
 
 
 def contents(folder):
-    """Bytes of everything that a repeated collection must reproduce."""
+    """Bytes of the files that a repeated collection must reproduce."""
     quoting = ("provenance.json", "card.md")  # they name command and commit
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.name not in quoting}
 
@@ -57,7 +57,7 @@ def test_stored_actions_replay_to_stored_rewards(whole):
         np.testing.assert_array_equal(replay_rewards("walker_walk", shard["physics"][rows][0], action[1:]), reward[1:])
 
 
-def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
+def test_resuming_with_another_renderer_is_rejected(tmp_path, monkeypatch):
     out, info = tmp_path / "set", render_info("walker_walk")
     collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
     shard = out / "1_walker_walk_random.hdf5"
@@ -73,7 +73,7 @@ def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
     assert json.loads((out / "provenance.json").read_text())["render"] == info
 
 
-def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monkeypatch):
+def test_resumed_collection_writes_identical_files(whole, tmp_path, monkeypatch):
     out = tmp_path / "set"
     roll_out = module._roll_out
 
@@ -95,13 +95,13 @@ def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monke
     collect(config(out), LENGTH)
     assert contents(out) == contents(whole)
     assert (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns == first
-    assert json.loads((out / "provenance.json").read_text())["frames"] == LENGTH + 1, "of what this call wrote"
+    assert json.loads((out / "provenance.json").read_text())["frames"] == LENGTH + 1, "frames of this call"
     (out / "1_walker_walk_random.hdf5").unlink()
     collect(config(out), LENGTH)
-    assert contents(out) == contents(whole), "a shard that was lost is collected again"
+    assert contents(out) == contents(whole), "a lost shard is collected again"
 
 
-def test_the_number_of_workers_changes_nothing(tmp_path, monkeypatch):
+def test_collection_does_not_depend_on_worker_count(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "load_actor", lambda task, quality: actor(1))
     for workers in (1, 2):
         collect(config(tmp_path / str(workers), quality="expert", episodes=2, workers=workers), LENGTH)
@@ -120,7 +120,7 @@ def test_medium_expert_is_half_medium_then_half_expert(tmp_path, monkeypatch):
     assert not np.array_equal(read_shard(paths[0])["physics"][0], read_shard(paths[2])["physics"][0])
 
 
-def test_medium_replay_follows_the_run_from_random_actions_to_the_medium_actor(tmp_path, monkeypatch):
+def test_medium_replay_uses_training_snapshots_in_order(tmp_path, monkeypatch):
     ladder = Ladder.of([actor(1), actor(2), actor(3)], {"task": "walker_walk", "decisions": [20, 60, 100]})
     monkeypatch.setattr(module, "load_ladder", lambda task: replace(ladder, sha256="c" * 64))
     acting = []
@@ -139,7 +139,7 @@ def test_medium_replay_follows_the_run_from_random_actions_to_the_medium_actor(t
 
 
 @pytest.mark.parametrize("quality", ["medium_replay", "medium_expert"])
-def test_a_quality_without_an_actor_is_one_sentence(tmp_path, monkeypatch, quality):
+def test_quality_without_shipped_actor_is_rejected(tmp_path, monkeypatch, quality):
     from vd4rl_pomdp.policies import actor as actors
 
     monkeypatch.setattr(actors, "ASSETS", tmp_path / "none")
@@ -148,7 +148,7 @@ def test_a_quality_without_an_actor_is_one_sentence(tmp_path, monkeypatch, quali
     assert not (tmp_path / "set").exists()
 
 
-def test_provenance_is_kept_apart_from_the_config(whole):
+def test_provenance_is_separate_from_config(whole):
     provenance = json.loads((whole / "provenance.json").read_text())
     assert provenance["frames"] == 3 * (LENGTH + 1)
     assert provenance["render"]["canary"]
@@ -158,14 +158,14 @@ def test_provenance_is_kept_apart_from_the_config(whole):
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"frame_size": 64}, {"render": "exact"}, {"task": "cheetah_run"}])
-def test_a_folder_of_another_config_is_refused_untouched(whole, change):
+def test_collecting_into_folder_of_another_config_is_rejected(whole, change):
     before = contents(whole)
     with pytest.raises(UserError, match=f"differs in {next(iter(change))}"):
         collect(config(whole, **change), LENGTH)
     assert contents(whole) == before
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path):
+def test_collecting_into_foreign_folder_is_rejected(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="holds no collected dataset"):
         collect(config(tmp_path), LENGTH)
@@ -183,7 +183,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
         ({"actor": Path("a.safetensors"), "quality": "expert"}, "a.safetensors"),
     ],
 )
-def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change, message):
+def test_invalid_collect_settings_write_nothing(tmp_path, change, message):
     with pytest.raises(UserError, match=message):
         collect(config(tmp_path / "set", **change), LENGTH)
     assert not (tmp_path / "set").exists()
@@ -196,7 +196,7 @@ def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change, m
         ({"quality": "expert", "action_noise": 0.25}, "expert_noise0.25", 0.25),
     ],
 )
-def test_noise_is_executed_stored_and_named(monkeypatch, tmp_path, changes, name, std):
+def test_action_noise_is_executed_and_recorded(monkeypatch, tmp_path, changes, name, std):
     monkeypatch.setattr(module, "load_actor", lambda task, quality: actor(1))
     out = tmp_path / "set"
     shards = collect(config(out, episodes=2, **changes), LENGTH)
@@ -214,7 +214,7 @@ def test_noise_is_executed_stored_and_named(monkeypatch, tmp_path, changes, name
     assert "action_noise" not in read_attributes(quiet[0])
 
 
-def test_the_noise_has_the_standard_deviation_it_says(monkeypatch, tmp_path):
+def test_action_noise_has_requested_standard_deviation(monkeypatch, tmp_path):
     job = module._job(config(tmp_path, quality="expert_noisy"), actor(1), 0, 200)
     still = replace(actor(1), weights={k: 0 * v for k, v in actor(1).weights.items()})
     still.weights["log_std.bias"][:] = -20
@@ -223,13 +223,13 @@ def test_the_noise_has_the_standard_deviation_it_says(monkeypatch, tmp_path):
     assert noise.mean() == pytest.approx(0.0, abs=0.05)
 
 
-def test_a_noisy_quality_keeps_its_own_noise(tmp_path):
+def test_noisy_quality_rejects_action_noise_option(tmp_path):
     with pytest.raises(UserError, match="expert_noisy has its own noise"):
         collect(config(tmp_path / "set", quality="expert_noisy", action_noise=0.1), LENGTH)
     assert not (tmp_path / "set").exists()
 
 
-def test_physics_alone_gives_the_rewards_of_the_rendered_episodes(tmp_path, monkeypatch):
+def test_unrendered_episodes_equal_rendered_ones(tmp_path, monkeypatch):
     settings = config(tmp_path / "set", quality="medium_replay", episodes=2)
     rendered = [read_shard(path) for path in collect(replace(settings, out=tmp_path / "rendered"), LENGTH)]
     played = list(module.play(settings, LENGTH))
@@ -239,7 +239,7 @@ def test_physics_alone_gives_the_rewards_of_the_rendered_episodes(tmp_path, monk
     assert not (tmp_path / "set").exists()
 
 
-def test_the_published_table_of_sets_is_by_the_actors_that_ship():
+def test_recorded_actor_hashes_match_shipped_actors():
     recorded = json.loads((Path(__file__).parents[2] / "results/datasets/actors.json").read_text())
     for name, hashes in recorded.items():
         assert module.actor_hashes(CollectConfig(*name.split(), Path(), 200)) == hashes

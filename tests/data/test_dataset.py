@@ -28,7 +28,7 @@ def stack_identity(episode, t, frames=3):
     return [[episode, max(t - back, 0)] for back in reversed(range(frames))]
 
 
-def test_counts_and_names(dataset):
+def test_dataset_counts_names_and_returns(dataset):
     assert (dataset.num_rows, dataset.num_episodes, dataset.num_transitions) == (268, 3, 265)
     assert (dataset.action_dim, dataset.incomplete_episodes) == (6, 1)
     assert (dataset.task, dataset.quality, dataset.physics) == ("walker_walk", "expert", None)
@@ -39,7 +39,7 @@ def test_counts_and_names(dataset):
     np.testing.assert_allclose(dataset.returns, expected, rtol=1e-12)
 
 
-def test_frames_that_fit_into_no_memory_are_told_as_the_sets_not_as_a_batchs(dataset, monkeypatch):
+def test_out_of_memory_error_names_dataset_frames(dataset, monkeypatch):
     def full(self, device):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
@@ -48,7 +48,7 @@ def test_frames_that_fit_into_no_memory_are_told_as_the_sets_not_as_a_batchs(dat
         dataset.to("cuda")
 
 
-def test_every_field_of_every_transition_is_aligned(dataset):
+def test_transition_fields_are_aligned(dataset):
     batch = View(dataset).transitions(range(dataset.num_transitions))
     assert batch.obs.shape == batch.next_obs.shape == (265, 9, 84, 84)
     assert batch.obs.dtype == torch.uint8
@@ -62,7 +62,7 @@ def test_every_field_of_every_transition_is_aligned(dataset):
 
 
 @pytest.mark.parametrize("n", [2, 3, 10])
-def test_n_step_returns_stop_at_the_episodes_end(dataset, n):
+def test_n_step_returns_stop_at_episode_end(dataset, n):
     gamma = 0.5
     batch = View(dataset).transitions(range(dataset.num_transitions), n_step=n, gamma=gamma)
     taken = [min(n, LENGTHS[e] - 1 - t) for e, t in STARTS]
@@ -77,7 +77,7 @@ def test_n_step_returns_stop_at_the_episodes_end(dataset, n):
     np.testing.assert_array_equal(batch.next_action, np.stack(there))
 
 
-def test_stored_discounts_are_multiplied_and_may_be_zero(tmp_path):
+def test_stored_discounts_multiply_n_step_returns(tmp_path):
     rows = fake_rows((5,))
     rows["discount"] = np.array([9.0, 0.5, 0.25, 1.0, 0.0])
     (tmp_path / "set").mkdir()
@@ -89,7 +89,7 @@ def test_stored_discounts_are_multiplied_and_may_be_zero(tmp_path):
     np.testing.assert_allclose(batch.reward, [0.00005, 0.00105, 0.0023, 0.003], rtol=1e-5)
 
 
-def test_nothing_is_paid_for_an_episodes_first_row_whatever_it_stores(tmp_path):
+def test_reward_of_first_row_is_ignored(tmp_path):
     returns, rewards = [], []
     for name, stored in (("plain", 0.0), ("odd", 100.0)):
         rows = fake_rows((5, 3))
@@ -103,7 +103,7 @@ def test_nothing_is_paid_for_an_episodes_first_row_whatever_it_stores(tmp_path):
     assert rewards[0] == rewards[1]
 
 
-def test_an_episodes_last_row_has_no_return(dataset):
+def test_last_row_has_zero_return(dataset):
     reward, discount, successor = dataset.n_step_returns(torch.tensor([4, 3]), n_step=3, gamma=0.9)
     assert reward.tolist() == [0.0, pytest.approx(0.003)]
     assert discount.tolist() == [1.0, 1.0]
@@ -111,7 +111,7 @@ def test_an_episodes_last_row_has_no_return(dataset):
 
 
 @pytest.mark.parametrize("frames", [1, 2, 5])
-def test_stacks_of_any_depth_and_shape(dataset, frames):
+def test_frame_stacks_repeat_first_frame(dataset, frames):
     rows = torch.tensor([[0, 1, 5], [6, 8, 267]])
     stacks = View(dataset, frame_stack=frames).stacks(rows)
     assert stacks.shape == (2, 3, 3 * frames, 84, 84)
@@ -119,7 +119,7 @@ def test_stacks_of_any_depth_and_shape(dataset, frames):
     assert frame_identity(stacks).tolist() == expected
 
 
-def test_every_field_of_every_window_is_aligned(dataset):
+def test_window_fields_are_aligned(dataset):
     length = 3
     starts = [(e, t) for e, t in ROWS if t + length <= LENGTHS[e]]
     assert dataset.num_windows(length) == len(starts) == 3 + 1 + 258
@@ -138,7 +138,7 @@ def test_every_field_of_every_window_is_aligned(dataset):
     assert (batch.length.dtype, batch.has_action.dtype, batch.key.dtype) == (torch.int64, torch.bool, torch.int64)
 
 
-def test_an_episode_shorter_than_the_window_is_named(dataset):
+def test_window_longer_than_an_episode_is_rejected(dataset):
     for call in (lambda: dataset.num_windows(6), lambda: View(dataset).windows([0], 6)):
         with pytest.raises(
             UserError,
@@ -147,7 +147,7 @@ def test_an_episode_shorter_than_the_window_is_named(dataset):
             call()
 
 
-def test_an_episode_of_one_row_is_left_out_of_windows_of_any_length(tmp_path):
+def test_windows_skip_episodes_of_one_row(tmp_path):
     dataset = open_dataset(write_fake_set(tmp_path / "set", (1, 5, 1, 4, 1)), tmp_path / "cache")
     assert (dataset.num_windows(2), dataset.num_windows(4)) == (dataset.num_transitions, 3) == (7, 3)
     starts = View(dataset).windows([0, 1, 2], 4).key[:, 0]
@@ -164,37 +164,34 @@ ARRAYS = [np.array([7]), np.array([7], np.uint64), np.arange(7, 8)[::-1], np.bro
 
 @pytest.mark.parametrize("index", [7, [7], (7,), np.int64(7), torch.tensor(7), torch.tensor([7]), *ARRAYS])
 @pytest.mark.filterwarnings("error")
-def test_an_index_may_be_any_integers(dataset, index):
+def test_integer_indices_of_any_type_are_accepted(dataset, index):
     assert View(dataset).transitions(index).key.tolist() == [row_key(torch.tensor(2), torch.tensor(1)).item()]
     assert View(dataset).windows(index, 2).key[:, 0].tolist() == View(dataset).transitions(index).key.tolist()
 
 
 @pytest.mark.parametrize("index", [-1, 265, [0, 265], [[0]], 1.0, [True]])
-def test_an_index_out_of_range_or_of_another_kind_is_refused(dataset, index):
+def test_invalid_indices_are_rejected(dataset, index):
     with pytest.raises(IndexError):
         View(dataset).transitions(index)
     with pytest.raises(IndexError):
         View(dataset).windows(index, 2)
 
 
-def test_a_row_before_the_first_is_refused(dataset):
+def test_negative_rows_and_counts_below_one_are_rejected(dataset):
     with pytest.raises(IndexError, match="row -1 is out of range"):
         View(dataset).stacks(torch.tensor([0, -1]))
-
-
-def test_counts_below_one_are_refused(dataset):
     with pytest.raises(UserError, match="--n-step is 0"):
         View(dataset).transitions(0, n_step=0)
     with pytest.raises(UserError, match="--frame-stack is 0"):
         View(dataset, frame_stack=0)
 
 
-def test_gathered_frames_do_not_share_the_map(dataset):
+def test_gathered_frames_are_copies(dataset):
     View(dataset, frame_stack=1).stacks(torch.tensor([0])).fill_(255)
     assert dataset.frames[0].max() == 0
 
 
-def test_names_come_from_the_shards_before_the_folders(tmp_path):
+def test_shard_attributes_take_precedence_over_folder_names(tmp_path):
     folder = tmp_path / "cheetah_run" / "random"
     write_fake_set(folder, attributes={"task": "walker_walk", "set": "medium"})
     dataset = open_dataset(folder, tmp_path / "cache")
@@ -206,7 +203,7 @@ def test_names_come_from_the_shards_before_the_folders(tmp_path):
         open_dataset(folder, tmp_path / "cache")
 
 
-def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
+def test_samplers_are_seeded_and_cover_all_rows(dataset):
     def draws(sampler, count):
         return [next(batches).key.tolist() for batches in [iter(sampler)] for _ in range(count)]
 
@@ -225,7 +222,7 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
 
 
 @pytest.mark.gpu
-def test_a_device_changes_nothing(tmp_path):
+def test_cuda_batches_equal_cpu_batches(tmp_path):
     folder = write_fake_set(tmp_path / "set", (9, 5))
     for make in (
         lambda d: TransitionSampler(d, 32, RandomStream(torch.Generator().manual_seed(0)), n_step=3),
@@ -237,8 +234,8 @@ def test_a_device_changes_nothing(tmp_path):
             torch.testing.assert_close(there[name].cpu(), here[name])
 
 
-def test_every_trap_of_the_published_files_at_once(tmp_path):
-    """Cut inside episodes, a float step_type, `10_` after `9_`, two halves in one folder, no last row at the end."""
+def test_quirks_of_published_files_are_read_correctly(tmp_path):
+    """Shards cut within episodes, float step_type, `10_` after `9_`, two halves in one folder, no final row."""
     folder = tmp_path / "humanoid_walk" / "medium_expert"
     lengths = (9, 4, 9, 2)
     cuts = (1, 2, 3, 5, 6, 8, 9, 11, 12, 13, 22)  # the medium half begins with episode 3
@@ -259,12 +256,12 @@ def test_every_trap_of_the_published_files_at_once(tmp_path):
     np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t, 21) for e, t in starts]))
 
 
-def test_the_folder_within_the_tasks_is_the_quality_whatever_lies_above(tmp_path):
+def test_quality_is_the_folder_below_the_task(tmp_path):
     folder = write_fake_set(tmp_path / "expert" / "walker_walk" / "humanA")
     assert open_dataset(folder, tmp_path / "cache").quality == "humanA"
 
 
-def test_a_link_tells_a_set_as_the_folder_that_it_names_would(tmp_path):
+def test_symlink_names_determine_task_and_quality(tmp_path):
     held = write_fake_set(tmp_path / "held" / "medium", physics_dim=18)
     (tmp_path / "walker_walk").mkdir()
     (tmp_path / "walker_walk" / "expert").symlink_to(held)

@@ -1,4 +1,4 @@
-"""The published sets arrive whole and verified, and a part of one is told with the command that completes it."""
+"""Published sets download completely and verified; an incomplete one names the command that completes it."""
 
 import hashlib
 import re
@@ -26,7 +26,7 @@ FILES |= {f"{BOTH}/{name}": content for name, content in CONTENT.items()}
 
 @pytest.fixture
 def mirror(monkeypatch):
-    """A mirror on this machine that has small files in place of the published ones."""
+    """A local mirror with small files in place of the published ones."""
     hub = Hub()
     repo = hub.repos[f"datasets/{REPOSITORY}"] = Repo()
     repo.commit("main", {f"vd4rl/main/{path}": content for path, content in FILES.items()})
@@ -52,13 +52,13 @@ def fetch(mirror, destination, quality="expert", **options):
 
 
 def fetched(mirror):
-    """Names of the files that were asked for since the last call."""
+    """Names of the files requested since the last call."""
     found = {path.rpartition("/")[2] for path in mirror.requests if path.startswith("GET")}
     mirror.requests.clear()
     return sorted(found)
 
 
-def test_the_manifest_lists_the_published_sets():
+def test_manifest_lists_published_sets():
     listed = manifest()
     assert len(listed) == 86
     assert len({file.sha256 for file in listed}) == 62
@@ -66,18 +66,18 @@ def test_the_manifest_lists_the_published_sets():
     assert len({tuple(file.path.split("/")[2:4]) for file in listed}) == 15
 
 
-def test_one_command_fetches_several_sets(mirror, tmp_path, capsys):
+def test_download_command_fetches_several_sets(mirror, tmp_path, capsys):
     words = ["--task", "walker_walk", "--quality", "medium_expert", "expert", "--endpoint", mirror.endpoint]
     main(["data", "download", *words, "--out", str(tmp_path)])
     assert all((tmp_path / path).read_bytes() == content for path, content in FILES.items())
     assert capsys.readouterr().out.count("check them with") == 2
 
 
-def test_a_set_arrives_whole_and_nothing_is_fetched_or_stored_twice(mirror, tmp_path):
+def test_download_resumes_and_reuses_stored_shards(mirror, tmp_path):
     mirror.cut[f"vd4rl/main/{EXPERT}/1_a_expert.hdf5"] = 1
     expert = fetch(mirror, tmp_path)
     asked = {path.rpartition("/")[2]: count for path, count in mirror.requests.items() if path.startswith("GET")}
-    assert asked == {"0_a_expert.hdf5": 1, "1_a_expert.hdf5": 2}, "a cut connection is taken up again"
+    assert asked == {"0_a_expert.hdf5": 1, "1_a_expert.hdf5": 2}, "a cut connection is resumed"
     assert [shard.relative_to(tmp_path).as_posix() for shard in expert] == list(FILES)[:2]
     assert [shard.read_bytes() for shard in expert] == list(CONTENT.values())[:2]
     assert sorted(path.name for path in (tmp_path / EXPERT).iterdir()) == ["0_a_expert.hdf5", "1_a_expert.hdf5"]
@@ -90,7 +90,7 @@ def test_a_set_arrives_whole_and_nothing_is_fetched_or_stored_twice(mirror, tmp_
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
 
 
-def test_damage_is_found_by_size_and_on_request_by_hash(mirror, tmp_path):
+def test_damage_is_found_by_size_and_with_verify_by_hash(mirror, tmp_path):
     first, second = fetch(mirror, tmp_path)
     first.write_bytes(b"short")
     second.write_bytes(b"SECOND" * 999)
@@ -102,7 +102,7 @@ def test_damage_is_found_by_size_and_on_request_by_hash(mirror, tmp_path):
     assert second.read_bytes() == CONTENT["1_a_expert.hdf5"]
 
 
-def test_what_cannot_be_fetched_or_is_wrong_is_one_line_and_what_came_before_stays(mirror, tmp_path):
+def test_failed_download_keeps_complete_shards(mirror, tmp_path):
     mirror.damaged = {f"vd4rl/main/{EXPERT}/1_a_expert.hdf5"}
     with pytest.raises(UserError, match=r"1_a_expert\.hdf5: has a wrong SHA-256 and was removed; re-run the same"):
         fetch(mirror, tmp_path)
@@ -118,7 +118,7 @@ def test_what_cannot_be_fetched_or_is_wrong_is_one_line_and_what_came_before_sta
     assert fetched(mirror) == ["1_a_expert.hdf5"]
 
 
-def test_a_bad_word_is_told_before_anything_is_fetched(mirror, tmp_path, capsys):
+def test_invalid_names_are_rejected_before_any_request(mirror, tmp_path, capsys):
     for words in (["walker_walk", "foo", "--quality", "expert"], ["walker_walk", "--quality", "expert", "foo"]):
         with pytest.raises(SystemExit) as end:
             main(["data", "download", "--out", str(tmp_path), "--endpoint", mirror.endpoint, "--task", *words])
@@ -128,7 +128,7 @@ def test_a_bad_word_is_told_before_anything_is_fetched(mirror, tmp_path, capsys)
     assert not list(tmp_path.iterdir())
 
 
-def test_where_nobody_is_is_one_line(tmp_path, monkeypatch):
+def test_unreachable_endpoint_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "*")
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
     with pytest.raises(UserError, match=r"cannot be fetched .*choose another --endpoint"):
@@ -136,14 +136,14 @@ def test_where_nobody_is_is_one_line(tmp_path, monkeypatch):
     assert not [path for path in tmp_path.rglob("*.hdf5")]
 
 
-def test_a_users_token_goes_to_their_own_hub_alone(mirror, tmp_path, monkeypatch):
+def test_token_is_sent_only_to_configured_hub(mirror, tmp_path, monkeypatch):
     given = []
     monkeypatch.setattr(module, "hf_hub_download", lambda *words, token, **options: given.append(token) or "/nowhere")
     for own in (mirror.endpoint, f"{mirror.endpoint}0"):
         monkeypatch.setenv("HF_ENDPOINT", own)
         with pytest.raises(UserError, match="no such file"):
             fetch(mirror, tmp_path)
-    assert given == [None, False], "None: the user's own"
+    assert given == [None, False], "None: the user's token"
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_a_users_token_goes_to_their_own_hub_alone(mirror, tmp_path, monkeypatch
         (("walker_walk", "expert", "http://["), r"endpoint 'http://\[' is not an address"),
     ],
 )
-def test_what_is_not_published_is_refused(tmp_path, arguments, message):
+def test_unpublished_sets_and_bad_endpoints_are_rejected(tmp_path, arguments, message):
     task, quality, *endpoint = arguments
     with pytest.raises(UserError, match=message):
         download(task, quality, tmp_path, *endpoint)
@@ -163,21 +163,21 @@ def test_what_is_not_published_is_refused(tmp_path, arguments, message):
 
 
 @pytest.mark.usefixtures("mirror", "own_cache")
-def test_a_part_of_a_published_set_is_told_with_what_gets_the_rest(tmp_path):
+def test_incomplete_published_set_names_download_command(tmp_path):
     place = write_fake_set(tmp_path / EXPERT, names=["0_a_expert.hdf5"])
     part = f"{place}: contains 1 of 2 shards of V-D4RL's walker_walk expert (1_a_expert.hdf5 is missing); get the rest "
     command = f"`vd4rl-pomdp data download --task walker_walk --quality expert --out {tmp_path}`"
-    for tell in (open_dataset, write_card, lambda folder: push(folder, "datasets/lab/set")):
+    for read in (open_dataset, write_card, lambda folder: push(folder, "datasets/lab/set")):
         with pytest.raises(UserError, match=re.escape(f"{part}with {command}")):
-            tell(place)
+            read(place)
 
 
 @pytest.mark.usefixtures("mirror", "own_cache")
-def test_a_set_of_ones_own_is_opened_unless_it_is_named_as_a_part_of_a_published_one(tmp_path):
+def test_sets_that_are_not_published_parts_are_opened(tmp_path):
     names = ["0_a_expert.hdf5", "1_a_expert.hdf5"]
-    told = {"task": "walker_walk", "set": "expert"}
+    attributes = {"task": "walker_walk", "set": "expert"}
     write_fake_set(tmp_path / "a" / EXPERT, (5, 5), cuts=(5,), names=names)
-    write_fake_set(tmp_path / "b" / EXPERT, names=names[:1], attributes=told)
+    write_fake_set(tmp_path / "b" / EXPERT, names=names[:1], attributes=attributes)
     write_fake_set(tmp_path / "c" / "mine", names=names[:1])
     write_fake_set(tmp_path / "d" / EXPERT)
     for folder in (f"a/{EXPERT}", f"b/{EXPERT}", "c/mine", f"d/{EXPERT}"):

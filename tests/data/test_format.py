@@ -36,7 +36,7 @@ def alter(path, key, change):
         (["shard_10_reward_4", "shard_2_reward_30"], ["shard_2_reward_30", "shard_10_reward_4"]),
     ],
 )
-def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
+def test_shards_are_sorted_by_name_then_number(tmp_path, names, expected):
     for name in names:
         (tmp_path / f"{name}.hdf5").touch()
     assert [p.stem for p in shard_paths(tmp_path)] == expected
@@ -50,7 +50,7 @@ def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
         (["0", "2"], "has the shard 2, but not 1"),
     ],
 )
-def test_a_number_that_is_left_out_is_told(tmp_path, names, message):
+def test_missing_shard_number_is_rejected(tmp_path, names, message):
     for name in names:
         (tmp_path / f"{name}.hdf5").touch()
     with pytest.raises(UserError, match=f"{message}; download or collect it again, or number"):
@@ -58,20 +58,20 @@ def test_a_number_that_is_left_out_is_told(tmp_path, names, message):
 
 
 @pytest.mark.parametrize("names", [("0_a.hdf5", "0_a.h5"), ("0_a.hdf5", "00_a.hdf5"), ("a.HDF5", "a.hdf5")])
-def test_a_shard_that_is_there_twice_is_told(tmp_path, names):
+def test_duplicate_shard_is_rejected(tmp_path, names):
     for name in names:
         (tmp_path / name).touch()
     with pytest.raises(UserError, match=r"has both .* and .*, which are the same shard; remove one"):
         shard_paths(tmp_path)
 
 
-def test_only_visible_shards_are_listed(tmp_path):
+def test_hidden_and_foreign_files_are_no_shards(tmp_path):
     for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.txt", "0_a.hdf5", "collection.json", "provenance.json"):
         (tmp_path / name).touch()
     assert [p.name for p in shard_paths(tmp_path)] == ["0_a.hdf5"]
 
 
-def test_missing_and_empty_folders_are_refused_with_advice(tmp_path):
+def test_missing_and_empty_folders_are_rejected(tmp_path):
     with pytest.raises(UserError, match=r"nothing: no such folder"):
         shard_paths(tmp_path / "nothing")
     with pytest.raises(UserError, match=r"holds no \.hdf5 shards; collect"):
@@ -81,7 +81,7 @@ def test_missing_and_empty_folders_are_refused_with_advice(tmp_path):
         shard_paths(tmp_path)
 
 
-def test_a_written_shard_has_the_published_layout(tmp_path):
+def test_written_shard_has_published_layout(tmp_path):
     rows = fake_rows((4, 3), action_dim=2, physics_dim=5)
     write_shard(
         tmp_path / "0_a.hdf5", rows | {"step_type": rows["step_type"].astype(np.uint8)}, {"task": "x", "seed": 3}
@@ -103,7 +103,7 @@ def test_a_written_shard_has_the_published_layout(tmp_path):
         np.testing.assert_array_equal(back[key], rows[key])
 
 
-def test_frames_that_are_no_bytes_are_refused(tmp_path):
+def test_float_frames_are_rejected(tmp_path):
     """As of pictures from 0 to 1, of which nothing but black would be left."""
     rows = fake_rows([4])
     with pytest.raises(UserError, match="observation is float64; frames must be uint8, from 0 to 255"):
@@ -111,14 +111,14 @@ def test_frames_that_are_no_bytes_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_equal_rows_give_equal_bytes(tmp_path):
+def test_equal_rows_write_equal_bytes(tmp_path):
     for name in ("a.hdf5", "b.hdf5"):
         write_shard(tmp_path / name, fake_rows((3,)), {"seed": 1, "task": "x"})
     assert (tmp_path / "a.hdf5").read_bytes() == (tmp_path / "b.hdf5").read_bytes()
 
 
 @pytest.mark.parametrize("chunks", [(7, 1, 84, 84), (3000, 3, 84, 84)])
-def test_frames_come_in_order_whatever_the_chunks(tmp_path, chunks):
+def test_frames_are_read_in_order_for_any_chunking(tmp_path, chunks):
     frames = np.zeros((3000, 3, 84, 84), np.uint8)
     frames[:, 0, 0, 0], frames[:, 0, 0, 1] = np.arange(3000) // 256, np.arange(3000) % 256
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
@@ -128,7 +128,7 @@ def test_frames_come_in_order_whatever_the_chunks(tmp_path, chunks):
     np.testing.assert_array_equal(np.concatenate(blocks), frames)
 
 
-def test_a_full_disk_leaves_the_old_shard_and_no_temporary(shard, monkeypatch):
+def test_full_disk_keeps_old_shard(shard, monkeypatch):
     before = shard.read_bytes()
 
     def full(path, data):
@@ -174,7 +174,7 @@ def with_value(index, value):
         ("observation", lambda v: v[:0], r"'observation' is uint8 of shape \(0, "),
     ],
 )
-def test_a_broken_key_is_named(shard, key, change, message):
+def test_invalid_arrays_are_named(shard, key, change, message):
     alter(shard, key, change)
     with pytest.raises(UserError, match=message) as caught:
         read_shard(shard)
@@ -182,7 +182,7 @@ def test_a_broken_key_is_named(shard, key, change, message):
     assert "\n" not in str(caught.value)
 
 
-def test_truncated_and_foreign_files_are_refused(shard):
+def test_truncated_and_foreign_files_are_rejected(shard):
     whole = shard.read_bytes()
     for content in (whole[: len(whole) // 2], b"no HDF5 at all" * 100, b""):
         shard.write_bytes(content)
@@ -191,7 +191,7 @@ def test_truncated_and_foreign_files_are_refused(shard):
         assert "\n" not in str(caught.value)
 
 
-def test_damaged_pixels_are_an_error(tmp_path):
+def test_damaged_pixels_are_rejected(tmp_path):
     write_fake_set(tmp_path, (300,))
     path = tmp_path / "0_fake.hdf5"
     with h5py.File(path) as file:
@@ -204,7 +204,7 @@ def test_damaged_pixels_are_an_error(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["observation", "reward", "physics"])
-def test_a_null_dataset_is_no_array(shard, key):
+def test_null_dataset_counts_as_missing(shard, key):
     with h5py.File(shard, "a") as file:
         file.pop(key, None)
         file.create_dataset(key, data=h5py.Empty("f8"))
@@ -229,7 +229,7 @@ def outside(file: h5py.File, folder: Path, kind: str, value: np.ndarray) -> None
 
 
 @pytest.mark.parametrize("kind", ["link", "storage", "virtual"])
-def test_values_in_other_files_are_not_followed(shard, tmp_path, kind):
+def test_external_storage_is_rejected(shard, tmp_path, kind):
     with h5py.File(shard, "a") as file:
         value = file["reward"][()]
         del file["reward"]
@@ -241,7 +241,7 @@ def test_values_in_other_files_are_not_followed(shard, tmp_path, kind):
 
 
 @pytest.mark.parametrize("stored", ["[1]", "{", 5, '{"task": ' + "[" * 100_000])
-def test_attributes_that_are_no_json_object_are_refused(shard, stored):
+def test_attributes_other_than_json_object_are_rejected(shard, stored):
     with h5py.File(shard, "a") as file:
         file.attrs["vd4rl_pomdp"] = stored
     with pytest.raises(UserError, match=r"0_fake\.hdf5: "):

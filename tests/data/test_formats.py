@@ -1,4 +1,4 @@
-"""Sets of other libraries in and out: what those libraries write is read, what is written they read."""
+"""Import and export of other libraries' formats: Minari, OGBench, V-D4RL's .npz."""
 
 import os
 import shutil
@@ -39,13 +39,13 @@ BOUNDS = np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32)
 
 @pytest.fixture
 def minari(tmp_path, monkeypatch):
-    """The library, whose own folder is the test's."""
+    """Minari, with its datasets in `tmp_path`."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return pytest.importorskip("minari")
 
 
 class Screen(gymnasium.Env):
-    """Shows (episode, t) as `fake_frame` does, in any layout; the task ends every second episode, a limit others."""
+    """Shows `fake_frame(episode, t)` in any layout; even episodes terminate, odd ones are truncated."""
 
     def __init__(self, layout=lambda frame: frame, actions=None, steps=6, buffer=False):
         self.layout, self.steps, self.episode, self.shown = layout, steps, -1, None
@@ -78,8 +78,8 @@ class Screen(gymnasium.Env):
 
 
 def record(minari, env, name="test/screen-v0", episodes=2, cut=False, **options):
-    """What Minari's collector writes of an environment, and the actions that were taken."""
-    pytest.importorskip("jax")  # which the collector needs
+    """Record episodes with Minari's collector and return their actions."""
+    pytest.importorskip("jax")  # the collector needs it
     collector = minari.DataCollector(env, **options)
     taken = []
     for _ in range(episodes):
@@ -107,7 +107,7 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("storage", ["hdf5", "arrow"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_minaris_recordings_come_in_to_the_byte(minari, layout, storage, tmp_path):
+def test_minari_recordings_are_imported_exactly(minari, layout, storage, tmp_path):
     if storage == "arrow":
         pytest.importorskip("pyarrow")
     taken = record(minari, Screen(LAYOUTS[layout]), data_format=storage, jpeg_encoding=False)
@@ -116,16 +116,16 @@ def test_minaris_recordings_come_in_to_the_byte(minari, layout, storage, tmp_pat
     wanted = [fake_episode(number, 7, 2) for number in range(2)]
     for key in ("observation", "reward", "step_type"):
         np.testing.assert_array_equal(rows[key], np.concatenate([one[key] for one in wanted]))
-    # a_t stood beside o_t: here it stands with o_{t+1}, in units of its bounds
+    # Minari stores a_t with o_t; V-D4RL stores it with o_{t+1}, scaled to [-1, 1]
     action = rows["action"].reshape(2, 7, 2)
     assert not action[:, 0].any()
     scaled = (taken.astype(float) - BOUNDS[0]) / (BOUNDS[1] - BOUNDS[0]) * 2 - 1
     np.testing.assert_allclose(action[:, 1:].reshape(-1, 2), scaled, atol=1e-6)
-    # the task ended the first episode, a time limit the second
+    # the first episode terminates, the second is truncated
     assert rows["discount"].tolist() == [1] * 6 + [0] + [1] * 7
 
 
-def test_a_recording_that_reset_cuts_ends_by_truncation(minari, tmp_path):
+def test_minari_episode_cut_by_reset_is_truncated(minari, tmp_path):
     record(minari, Screen(), cut=True)
     import_set("minari", str(tmp_path / "minari" / "test" / "screen-v0"), tmp_path / "set")
     rows = rows_of_set(tmp_path / "set")
@@ -133,19 +133,20 @@ def test_a_recording_that_reset_cuts_ends_by_truncation(minari, tmp_path):
     assert rows["discount"][-1] == 1
 
 
-def test_minaris_jpeg_is_told(minari, tmp_path, capsys):
-    record(minari, Screen(LAYOUTS["channels last"]))
+@pytest.mark.parametrize(
+    ("screen", "note"),
+    [
+        ({"layout": LAYOUTS["channels last"]}, "its images are JPEG"),
+        ({"buffer": True}, "in every episode all images are equal"),
+    ],
+)
+def test_lossy_minari_recordings_print_a_note(minari, tmp_path, capsys, screen, note):
+    record(minari, Screen(**screen))
     import_set("minari", "test/screen-v0", tmp_path / "set")
-    assert "its images are JPEG" in capsys.readouterr().err
+    assert note in capsys.readouterr().err
 
 
-def test_a_buffer_that_minari_kept_is_told(minari, tmp_path, capsys):
-    record(minari, Screen(buffer=True))
-    import_set("minari", "test/screen-v0", tmp_path / "set")
-    assert "in every episode all images are equal" in capsys.readouterr().err
-
-
-def test_discrete_actions_become_columns(minari, tmp_path, capsys):
+def test_discrete_actions_become_one_hot_columns(minari, tmp_path, capsys):
     taken = record(minari, Screen(actions=gymnasium.spaces.Discrete(4, start=1)))
     import_set("minari", "test/screen-v0", tmp_path / "set")
     action = rows_of_set(tmp_path / "set")["action"].reshape(2, 7, 4)[:, 1:].reshape(-1, 4)
@@ -162,21 +163,21 @@ def test_discrete_actions_become_columns(minari, tmp_path, capsys):
         (lambda frame: frame[:, :60], "images of 60x84 pixels.*pass --size"),
     ],
 )
-def test_what_is_no_set_of_pictures_is_refused(minari, layout, message, tmp_path):
+def test_minari_set_without_usable_images_is_rejected(minari, layout, message, tmp_path):
     record(minari, Screen(layout))
     with pytest.raises(UserError, match=message):
         import_set("minari", "test/screen-v0", tmp_path / "set")
     assert not (tmp_path / "set").exists()
 
 
-def test_a_set_of_one_camera_is_not_taken_for_that_of_another(minari, tmp_path):
+def test_importing_another_camera_into_same_folder_is_rejected(minari, tmp_path):
     record(minari, Screen(lambda frame: {"left": frame, "right": 255 - frame}), jpeg_encoding=False)
     import_set("minari", "test/screen-v0", tmp_path / "set", picture="left")
     with pytest.raises(UserError, match="holds a dataset that differs in source; choose another --out"):
         import_set("minari", "test/screen-v0", tmp_path / "set", picture="right")
 
 
-def test_minari_out_and_in_loses_nothing(minari, tmp_path):
+def test_minari_round_trip_is_lossless(minari, tmp_path):
     attributes = {"task": "walker_walk", "set": "mine"}
     folder = write_fake_set(tmp_path / "own", LENGTHS, complete_last=False, physics_dim=18, attributes=attributes)
     main(["data", "export", "minari", str(folder), str(tmp_path / "minari" / "walker" / "mine-v0")])
@@ -193,7 +194,7 @@ def test_minari_out_and_in_loses_nothing(minari, tmp_path):
     assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
 
 
-def test_minari_writes_to_a_relative_path_and_a_damaged_set_is_told(minari, tmp_path, monkeypatch):
+def test_minari_relative_paths_and_damaged_metadata(minari, tmp_path, monkeypatch):
     folder = write_fake_set(tmp_path / "own", [4])
     monkeypatch.chdir(tmp_path)
     export_set("minari", folder, Path("out-v0"))
@@ -217,7 +218,7 @@ def test_minari_writes_to_a_relative_path_and_a_damaged_set_is_told(minari, tmp_
         *(({key: np.zeros((n, *of), kind) for key, of, kind in KEYS}, "has no step") for n in (0, 1)),
     ],
 )
-def test_a_damaged_episode_is_named_and_nothing_is_left_behind(changed, message, tmp_path, capsys):
+def test_import_of_damaged_episode_leaves_nothing(changed, message, tmp_path, capsys):
     export_set("vd4rl_npz", write_fake_set(tmp_path / "own", [5, 5]), tmp_path / "npz")
     with np.load(file := tmp_path / "npz" / "000001-5.npz") as stored:
         np.savez(file, **(dict(stored) | changed))
@@ -232,19 +233,19 @@ def test_a_damaged_episode_is_named_and_nothing_is_left_behind(changed, message,
     (tmp_path / "empty").mkdir()
     with pytest.raises(SystemExit):
         main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "empty")])
-    assert list((tmp_path / "empty").iterdir()) == [], "a folder of the user's own stays"
+    assert list((tmp_path / "empty").iterdir()) == [], "the user's existing folder stays"
 
 
-def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
+def test_minari_export_notes_losses(minari, tmp_path, capsys):
     episodes = [fake_episode(0, 5), fake_episode(1, 1), fake_episode(2, 5)]
     episodes[0]["discount"][2], episodes[1]["step_type"][0] = 0.5, StepType.FIRST
     (tmp_path / "own").mkdir()
     rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
     write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk"})
     export_set("minari", tmp_path / "own", tmp_path / "a-v0")
-    told = capsys.readouterr().err
-    assert "episodes of a single row" in told
-    assert "discounts other than" in told
+    stderr = capsys.readouterr().err
+    assert "episodes of a single row" in stderr
+    assert "discounts other than" in stderr
     with pytest.raises(UserError, match="call the folder walker-v0"):
         export_set("minari", tmp_path / "own", tmp_path / "walkers" / "walker")
     assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
@@ -253,7 +254,7 @@ def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
 
 
 def write_ogbench(path, episodes):
-    """What OGBench's generating scripts save of episodes of (T + 1, 64, 64, 3) pictures and (T + 1, A) actions."""
+    """Write (T + 1, 64, 64, 3) images and (T + 1, A) actions as OGBench's generation scripts do."""
     pictures, actions = ([one[part] for one in episodes] for part in (0, 1))
     terminals = np.concatenate([np.arange(len(one)) == len(one) - 1 for one in actions])
     np.savez_compressed(
@@ -262,7 +263,7 @@ def write_ogbench(path, episodes):
     return path
 
 
-def test_ogbenchs_own_transitions_are_ours(tmp_path):
+def test_ogbench_import_matches_ogbench_loader(tmp_path):
     ogbench = pytest.importorskip("ogbench.utils")
     rng = np.random.default_rng(0)
     sizes = [5, 8, 3]
@@ -285,14 +286,14 @@ def test_ogbenchs_own_transitions_are_ours(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["observations", "actions", "terminals"])
-def test_ogbenchs_arrays_are_of_one_length(key, tmp_path):
+def test_ogbench_arrays_of_unequal_length_are_rejected(key, tmp_path):
     path = write_ogbench(
         tmp_path / "x-v0.npz", [(np.zeros((4, 64, 64, 3), np.uint8), np.zeros((4, 2), np.float32))] * 2
     )
     with np.load(path) as stored:
         np.savez(path, **(dict(stored) | {key: stored[key][:4]}))
-    told = [4 if name == key else 8 for name in ("observations", "actions", "terminals")]
-    with pytest.raises(UserError, match=r"x-v0.npz: has {} images, {} actions and {} terminals".format(*told)):
+    counts = [4 if name == key else 8 for name in ("observations", "actions", "terminals")]
+    with pytest.raises(UserError, match=r"x-v0.npz: has {} images, {} actions and {} terminals".format(*counts)):
         import_set("ogbench", str(path), tmp_path / "set")
     write_ogbench(path, [(np.zeros((1, 64, 64, 3), np.uint8), np.zeros((1, 2), np.float32))])
     with pytest.raises(UserError, match=r"x-v0.npz: episode 0: has no step"):
@@ -301,7 +302,7 @@ def test_ogbenchs_arrays_are_of_one_length(key, tmp_path):
 
 
 @pytest.mark.parametrize("key", ["observations", "actions", "rewards", "terminations", "truncations", "infos/physics"])
-def test_minaris_arrays_are_of_one_length(minari, key, tmp_path):
+def test_minari_arrays_of_unequal_length_are_rejected(minari, key, tmp_path):
     folder = write_fake_set(tmp_path / "own", [5, 5], physics_dim=18, attributes={"task": "walker_walk"})
     export_set("minari", folder, tmp_path / "a-v0")
     with h5py.File(tmp_path / "a-v0" / "data" / "main_data.hdf5", "r+") as file:
@@ -314,7 +315,7 @@ def test_minaris_arrays_are_of_one_length(minari, key, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
-def test_an_ogbench_set_of_states_or_a_cut_file_is_refused(tmp_path):
+def test_ogbench_states_and_truncated_files_are_rejected(tmp_path):
     states = write_ogbench(tmp_path / "cube-v0.npz", [(np.zeros((3, 28), np.float32), np.zeros((3, 5), np.float32))])
     with pytest.raises(UserError, match="holds no images"):
         import_set("ogbench", str(states), tmp_path / "set")
@@ -323,7 +324,7 @@ def test_an_ogbench_set_of_states_or_a_cut_file_is_refused(tmp_path):
         import_set("ogbench", str(states), tmp_path / "set")
 
 
-def test_npz_episodes_out_and_in_lose_nothing_but_states(tmp_path, capsys):
+def test_npz_round_trip_loses_only_physics(tmp_path, capsys):
     folder = write_fake_set(tmp_path / "walker_walk" / "expert", LENGTHS, complete_last=False, physics_dim=18)
     main(["data", "export", "vd4rl_npz", str(folder), str(tmp_path / "npz")])
     assert "simulator states" in capsys.readouterr().err
@@ -336,14 +337,14 @@ def test_npz_episodes_out_and_in_lose_nothing_but_states(tmp_path, capsys):
     assert_equal_rows(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
 
 
-def test_published_64_pixel_sets_are_told_to_be_cut_short(tmp_path, capsys):
+def test_published_64_pixel_sets_print_a_note(tmp_path, capsys):
     folder = write_fake_set(tmp_path / "own", [5, 5], attributes={"task": "walker_walk"})
     place = tmp_path / "main" / "walker_walk" / "medium_expert" / "64px"
     export_set("vd4rl_npz", folder, place, size=64)
     import_set("vd4rl_npz", str(place), tmp_path / "set")
-    told = capsys.readouterr().err
-    assert "the published 64-pixel datasets are incomplete" in told
-    assert "2 episodes of the expert only" in told
+    stderr = capsys.readouterr().err
+    assert "the published 64-pixel datasets are incomplete" in stderr
+    assert "2 episodes of the expert only" in stderr
     dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
     assert (dataset.task, dataset.quality, dataset.frame_size) == ("walker_walk", "medium_expert", 64)
 
@@ -362,7 +363,7 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     assert_equal_rows(rows_of_set(tmp_path / "own"), rows_of_set(tmp_path / "small"), but=["observation"])
 
 
-def test_a_cut_import_goes_on_and_ends_in_the_same_files(tmp_path, monkeypatch):
+def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch):
     folder = write_fake_set(tmp_path / "own", [7, 9, 8, 12, 5], attributes={"task": "walker_walk"})
     monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 20)
     whole = import_set("vd4rl", str(folder), tmp_path / "whole")
@@ -389,7 +390,7 @@ def test_a_cut_import_goes_on_and_ends_in_the_same_files(tmp_path, monkeypatch):
         import_set("vd4rl", str(other), tmp_path / "set")
 
 
-def test_a_cut_export_leaves_nothing_and_begins_anew(tmp_path, monkeypatch):
+def test_interrupted_export_leaves_nothing(tmp_path, monkeypatch):
     folder, save, saved = write_fake_set(tmp_path / "own", LENGTHS), np.savez_compressed, []
 
     def cut(path, **rows):
@@ -412,7 +413,7 @@ def test_a_cut_export_leaves_nothing_and_begins_anew(tmp_path, monkeypatch):
         export_set("ogbench", folder, tmp_path / "b")
 
 
-def test_actions_outside_their_bounds_are_refused_or_clipped(tmp_path, capsys):
+def test_out_of_bounds_actions_are_rejected_or_clipped(tmp_path, capsys):
     rows = fake_episode(0, 5)
     rows["action"][2] = 1.5
     (tmp_path / "own").mkdir()
@@ -424,7 +425,7 @@ def test_actions_outside_their_bounds_are_refused_or_clipped(tmp_path, capsys):
     assert rows_of_set(tmp_path / "set")["action"].max() == 1
 
 
-def test_a_recording_through_autoreset_is_told(minari, tmp_path, capsys):
+def test_minari_recording_through_autoreset_prints_a_note(minari, tmp_path, capsys):
     pytest.importorskip("jax")
     collector = minari.DataCollector(gymnasium.wrappers.Autoreset(Screen(steps=3)))
     collector.reset(seed=0)
@@ -435,7 +436,7 @@ def test_a_recording_through_autoreset_is_told(minari, tmp_path, capsys):
     assert "every episode begins with the last image of the one before" in capsys.readouterr().err
 
 
-def test_the_environment_tells_the_task(minari, tmp_path, capsys):
+def test_minari_env_spec_determines_task(minari, tmp_path, capsys):
     env = Screen()
     env.spec = gymnasium.spec("vd4rl_pomdp/WalkerWalk-Patch16-v0")
     record(minari, env)
@@ -444,7 +445,7 @@ def test_the_environment_tells_the_task(minari, tmp_path, capsys):
     assert open_dataset(tmp_path / "set", tmp_path / "cache").task == "walker_walk"
 
 
-def test_a_set_without_a_task_trains_and_is_not_evaluated(tmp_path, own_cache):
+def test_set_without_task_trains_without_evaluation(tmp_path, own_cache):
     source = str(write_fake_set(tmp_path / "own", LENGTHS))
     folder = import_set("vd4rl", source, tmp_path / "pushing", quality="x")[0].parent
     pretrain(smoke_pretrain(folder, tmp_path / "run"))
@@ -461,11 +462,11 @@ def test_a_set_without_a_task_trains_and_is_not_evaluated(tmp_path, own_cache):
     (tmp_path / "g.toml").write_text(text + '"patch+zero_frames"}\nfinetune = {eval_episodes = 0}\n')
     cells = load_grid(str(tmp_path / "g.toml")).cells()
     jobs, _ = plan_jobs(cells, tmp_path, tmp_path / "sets")
-    assert [job.finished for job in jobs] == [True] * 3, "a grid finds both runs"
-    assert len(GridMembers("g.toml", cells).among(find_results([tmp_path]))) == 2, "and so does its report"
+    assert [job.finished for job in jobs] == [True] * 3, "the grid finds both runs"
+    assert len(GridMembers("g.toml", cells).among(find_results([tmp_path]))) == 2, "so does its report"
 
 
-def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):
+def test_grid_accepts_imported_set(tmp_path):
     own = write_fake_set(tmp_path / "own", LENGTHS, attributes={"task": "walker_walk"})
     import_set("vd4rl", str(own), tmp_path / "set")
     DataSet("set", tmp_path / "set", "collect", {"task": "walker_walk"}).check()

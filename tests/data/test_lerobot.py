@@ -1,4 +1,4 @@
-"""LeRobot's format out and in. What LeRobot itself makes of it: `tools/lerobot_check.py`."""
+"""Export and import of LeRobot's format. `tools/lerobot_check.py` reads an export with LeRobot itself."""
 
 import json
 
@@ -24,7 +24,7 @@ DATA, INDEX = (f"{part}/chunk-000/file-000.parquet" for part in ("data", "meta/e
 
 @pytest.fixture
 def exported(tmp_path):
-    """A set of noise in LeRobot's format, and where it came from."""
+    """A set with noise images in LeRobot's format, and its source."""
     rng, episodes = np.random.default_rng(0), [fake_episode(number, length) for number, length in enumerate(LENGTHS)]
     rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
     rows[FRAMES_KEY] = rng.integers(0, 256, rows[FRAMES_KEY].shape, np.uint8)
@@ -35,19 +35,19 @@ def exported(tmp_path):
 
 
 def rewrite(folder, change, name=DATA):
-    """Change a table of a set."""
+    """Apply `change` to a parquet table of a set."""
     pq.write_table(change(pq.read_table(folder / name)), folder / name, row_group_size=7)
 
 
-def tell(folder, change):
-    """Change info.json."""
+def edit_info(folder, change):
+    """Apply `change` to info.json."""
     info = json.loads((folder / "meta" / "info.json").read_text())
     change(info)
     (folder / "meta" / "info.json").write_text(json.dumps(info))
 
 
 def as_others_write(folder, scale=1.0):
-    """A set without this package's marks: one row for each action, whose units and last rewards are its own."""
+    """Make it a set of another writer: one row per action, actions scaled, no discounts and no final image."""
 
     def without_last(table):
         numbers = table["episode_index"].to_numpy()
@@ -60,11 +60,11 @@ def as_others_write(folder, scale=1.0):
     rewrite(folder, without_last)
     shorter = arrow.array([length - 1 for length in LENGTHS])
     rewrite(folder, lambda t: t.set_column(t.schema.get_field_index("length"), "length", shorter), INDEX)
-    tell(folder, lambda info: info["features"].pop("next.discount"))
-    tell(folder, lambda info: info.update(total_frames=sum(LENGTHS) - 3))
+    edit_info(folder, lambda info: info["features"].pop("next.discount"))
+    edit_info(folder, lambda info: info.update(total_frames=sum(LENGTHS) - 3))
 
 
-def test_pictures_in_the_rows_lose_nothing(tmp_path, capsys):
+def test_lerobot_image_round_trip_is_lossless(tmp_path, capsys):
     attributes = {"task": "walker_walk", "set": "mine"}
     own = write_fake_set(tmp_path / "own", LENGTHS, 1, complete_last=False, physics_dim=2, attributes=attributes)
     main(["data", "export", "lerobot", str(own), str(tmp_path / "out")])
@@ -76,7 +76,7 @@ def test_pictures_in_the_rows_lose_nothing(tmp_path, capsys):
     assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
 
 
-def test_rows_are_lerobots(exported):
+def test_exported_rows_follow_lerobot_format(exported):
     rows = pq.read_table(exported[0] / DATA).slice(LENGTHS[0], LENGTHS[1]).to_pydict()
     action = fake_episode(1, 25)["action"]
     np.testing.assert_array_equal(rows["action"], [*action[1:], action[-1]])  # a_t beside o_t, the last one twice
@@ -93,7 +93,7 @@ def test_rows_are_lerobots(exported):
     assert (np.shape(stats["observation.image"]["mean"]), stats["action"]["count"]) == ((3, 1, 1), [54])
 
 
-def test_video_changes_pictures_alone_and_says_by_how_much(tmp_path, capsys):
+def test_lerobot_video_changes_only_images(tmp_path, capsys):
     own, rows = tmp_path / "own", fake_episode(0, 25)
     grey = np.arange(25, dtype=np.uint8) * 10
     rows[FRAMES_KEY] = np.broadcast_to(grey[:, None, None, None], (25, 3, 84, 84))
@@ -105,7 +105,7 @@ def test_video_changes_pictures_alone_and_says_by_how_much(tmp_path, capsys):
     back = rows_of_set(tmp_path / "back")
     assert_equal_rows(rows_of_set(own), back, but=[FRAMES_KEY])
     assert np.abs(back[FRAMES_KEY].astype(int) - rows[FRAMES_KEY]).max() <= 2
-    # LeRobot puts many episodes into one video: here the same one begins at 0.4 seconds
+    # LeRobot puts many episodes into one video: this episode now begins at 0.4 seconds
     film = tmp_path / "out" / "videos" / "observation.image" / "chunk-000" / "file-000.mp4"
     _encode(film, np.concatenate([rows[FRAMES_KEY][:8], rows[FRAMES_KEY]]).transpose(0, 2, 3, 1))
     column = "videos/observation.image/from_timestamp"
@@ -118,13 +118,13 @@ def test_video_changes_pictures_alone_and_says_by_how_much(tmp_path, capsys):
         import_set("lerobot", str(tmp_path / "out"), tmp_path / "damaged")
 
 
-def test_a_set_without_a_last_picture_is_read_up_to_there(exported, tmp_path, capsys):
+def test_lerobot_set_without_final_images_drops_last_step(exported, tmp_path, capsys):
     out, own = exported
     as_others_write(out, scale=100)
     import_set("lerobot", str(out), tmp_path / "back")
-    told = capsys.readouterr().err
-    assert "rewards (3.048 in all) of 3 episodes have no following image" in told
-    assert "each dimension's minimum and maximum become -1 and 1" in told
+    stderr = capsys.readouterr().err
+    assert "rewards (3.048 in all) of 3 episodes have no following image" in stderr
+    assert "each dimension's minimum and maximum become -1 and 1" in stderr
     rows, given = rows_of_set(tmp_path / "back"), rows_of_set(own)
     kept = np.concatenate([np.arange(19), 20 + np.arange(24), 45 + np.arange(8)])
     np.testing.assert_array_equal(rows[FRAMES_KEY], given[FRAMES_KEY][kept])
@@ -136,19 +136,21 @@ def test_a_set_without_a_last_picture_is_read_up_to_there(exported, tmp_path, ca
     np.testing.assert_allclose(action[:, 0] - slope * theirs[:, 0], (action - slope * theirs)[0, 0], atol=1e-4)
 
 
-def test_reading_from_an_episode_on_gives_the_same_rows(exported):
+def test_reading_from_later_episode_gives_same_rows(exported):
     opened = LEROBOT.read(str(exported[0]), None)
     for first in range(3):
         for late, whole in zip(opened.read(first), list(opened.read(0))[first:], strict=True):
             assert_equal_rows(late, whole)
 
 
-def test_one_of_several_cameras(exported, tmp_path):
+def test_lerobot_camera_is_selected_by_picture_option(exported, tmp_path):
     def second(table):
         return table.append_column("observation.images.top", table["observation.image"].take(list(range(53, -1, -1))))
 
     rewrite(exported[0], second)
-    tell(exported[0], lambda i: i["features"].update({"observation.images.top": i["features"]["observation.image"]}))
+    edit_info(
+        exported[0], lambda i: i["features"].update({"observation.images.top": i["features"]["observation.image"]})
+    )
     with pytest.raises(UserError, match=r"choose one with --picture, of observation.image, observation.images.top"):
         import_set("lerobot", str(exported[0]), tmp_path / "back")
     import_set("lerobot", str(exported[0]), tmp_path / "back", picture="observation.images.top")
@@ -160,28 +162,37 @@ def test_one_of_several_cameras(exported, tmp_path):
     ("damage", "message"),
     [
         (lambda out: (out / "meta" / "info.json").unlink(), "not a local LeRobot dataset"),
-        (lambda out: tell(out, lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
-        (lambda out: tell(out, lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
-        (lambda out: tell(out, lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
-        (lambda out: tell(out, lambda info: info.pop("features")), r"info.json: its features is missing or damaged"),
-        (lambda out: tell(out, lambda info: info.update(fps="20")), r"info.json: its fps is missing or damaged"),
-        (lambda out: tell(out, lambda info: info["features"].update(action=[])), "its action is missing or damaged"),
-        (lambda out: tell(out, lambda i: i["features"][PICTURE].update(shape=[64, 64, 3])), "84x84 pixels, .* 64x64"),
-        (lambda out: tell(out, lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
+        (lambda out: edit_info(out, lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
+        (lambda out: edit_info(out, lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
+        (lambda out: edit_info(out, lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
+        (
+            lambda out: edit_info(out, lambda info: info.pop("features")),
+            r"info.json: its features is missing or damaged",
+        ),
+        (lambda out: edit_info(out, lambda info: info.update(fps="20")), r"info.json: its fps is missing or damaged"),
+        (
+            lambda out: edit_info(out, lambda info: info["features"].update(action=[])),
+            "its action is missing or damaged",
+        ),
+        (
+            lambda out: edit_info(out, lambda i: i["features"][PICTURE].update(shape=[64, 64, 3])),
+            "84x84 pixels, .* 64x64",
+        ),
+        (lambda out: edit_info(out, lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
         (lambda out: (out / DATA).unlink(), "No such file"),
         (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
         (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "lacks rows"),
-        (lambda out: tell(out, lambda info: info["features"].pop("observation.image")), "holds no images"),
+        (lambda out: edit_info(out, lambda info: info["features"].pop("observation.image")), "holds no images"),
     ],
 )
-def test_what_cannot_be_read_is_told(exported, damage, message, tmp_path):
+def test_damaged_lerobot_sets_are_rejected(exported, damage, message, tmp_path):
     damage(exported[0])
     with pytest.raises(UserError, match=message):
         import_set("lerobot", str(exported[0]), tmp_path / "back")
     assert not (tmp_path / "back").exists()
 
 
-def test_video_of_an_odd_size_is_refused(exported, tmp_path):
+def test_lerobot_video_of_odd_size_is_rejected(exported, tmp_path):
     with pytest.raises(UserError, match="even height and width, not 63"):
         export_set("lerobot_video", exported[1], tmp_path / "film", size=63)
     assert not (tmp_path / "film").exists()

@@ -13,7 +13,7 @@ def exact():
 
 
 @pytest.mark.parametrize("task", golden_tasks())
-def test_the_environment_shows_the_golden_frames(exact, task):
+def test_environment_renders_golden_frames(exact, task):
     if not render_info()["gl_vendor"].startswith("Mesa"):
         pytest.skip("another renderer draws other edges")
     result = compare(exact[task], parity._golden()[f"{task}/frames"])
@@ -25,7 +25,7 @@ def test_the_environment_shows_the_golden_frames(exact, task):
 
 
 @pytest.mark.parametrize("task", golden_tasks())
-def test_fast_rendering_differs_by_less_than_a_twentieth_of_a_grey_level(exact, task):
+def test_fast_rendering_mean_difference_is_below_a_twentieth(exact, task):
     fast = canary_frames(task, "fast")
     difference = np.abs(fast.astype(int) - exact[task]).mean()
     assert 0 < difference < 0.05
@@ -33,19 +33,19 @@ def test_fast_rendering_differs_by_less_than_a_twentieth_of_a_grey_level(exact, 
 
 @pytest.fixture
 def unrepaired(monkeypatch):
-    """Environments with the sky of the installed mujoco."""
+    """Environments with the skybox of the installed mujoco."""
     monkeypatch.setattr(rendering, "prepare", lambda physics, render, size: None)
 
 
 @pytest.mark.usefixtures("unrepaired")
-def test_the_canary_fails_without_the_old_sky():
+def test_canary_fails_without_skybox_repair():
     result = check_parity()
     assert not result["equal"]
     assert not result["canary"]["walker_walk"]["equal"]
     assert not result["canary"]["cheetah_run"]["equal"]
 
 
-def test_render_info_names_versions_and_what_rendered(exact):
+def test_render_info_names_versions_and_renderer(exact):
     info = render_info()
     assert info["canary"] == rendering.frames_hash(exact["walker_walk"])
     assert info["gl_vendor"]
@@ -54,7 +54,7 @@ def test_render_info_names_versions_and_what_rendered(exact):
 
 
 class FakeSet:
-    """What parity reads of a data set."""
+    """The attributes of a dataset that parity reads."""
 
     def __init__(self, task, frames):
         self.task, self.num_rows, self.frames, self.frame_size = task, len(frames), self, 84
@@ -75,14 +75,14 @@ def background(monkeypatch, task, data, rendered):
     return parity._compare_background("somewhere")
 
 
-def test_the_background_of_our_own_frames_is_equal(monkeypatch, own_frames):
+def test_background_of_own_frames_is_equal(monkeypatch, own_frames):
     task, frames = own_frames
     result = background(monkeypatch, task, frames[:30], frames[10:])
     assert result["equal"]
     assert result["static_pixels"] > 1000
 
 
-def test_the_background_of_frames_under_another_sky_differs(monkeypatch, own_frames):
+def test_background_under_another_sky_differs(monkeypatch, own_frames):
     task, frames = own_frames
     with monkeypatch.context() as patch:
         patch.setattr(rendering, "prepare", lambda physics, render, size: None)
@@ -91,15 +91,15 @@ def test_the_background_of_frames_under_another_sky_differs(monkeypatch, own_fra
 
 
 @pytest.mark.parametrize("equal", [False, True])
-def test_the_background_of_a_set_decides_whatever_the_canaries_say(monkeypatch, equal):
-    """A GPU draws other canaries, and the same pixels as a set that a GPU drew."""
+def test_background_of_set_overrides_canaries(monkeypatch, equal):
+    """A GPU renders other canaries, but the same pixels as a set rendered on a GPU."""
     monkeypatch.setattr(parity, "_compare_background", lambda path: {"equal": equal})
     monkeypatch.setattr(parity, "compare", lambda *frames: {"equal": not equal})
     assert check_parity("somewhere")["equal"] is equal
     assert check_parity()["equal"] is not equal
 
 
-def test_a_set_of_an_unknown_task_is_refused(monkeypatch):
+def test_parity_of_unknown_task_is_rejected(monkeypatch):
     monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(None, np.zeros((2, 3, 84, 84), np.uint8)))
     with pytest.raises(UserError, match="cannot determine the task"):
         parity._compare_background("somewhere")

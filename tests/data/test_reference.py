@@ -1,4 +1,4 @@
-"""What a run is held against is what its set records, and only an actor that ships is known."""
+"""A run's reference values come from its dataset; only shipped actors are known."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ ACTOR = {"task": "walker_walk", "quality": "expert", "sha256": EXPERT}
     ],
     ids=["expert", "noisy", "medium", "two", "partly", "own", "other task", "random", "published", "no task"],
 )
-def test_a_sets_actor_is_known_if_it_is_one_and_ships(tmp_path, shards, known):
+def test_reference_actor_is_known_only_if_single_and_shipped(tmp_path, shards, known):
     (tmp_path / "set").mkdir()
     for number, attributes in enumerate(shards):
         write_shard(tmp_path / "set" / f"{number}_fake.hdf5", fake_rows([8, 8]), attributes)
@@ -49,13 +49,13 @@ def test_a_sets_actor_is_known_if_it_is_one_and_ships(tmp_path, shards, known):
     assert reference.mean_reward == pytest.approx(float(dataset.reward[dataset.t > 0].mean()), abs=1e-5)
 
 
-def test_a_reference_of_an_earlier_run_does_not_tell_its_rewards(tmp_path):
+def test_reference_of_earlier_version_has_no_mean_reward(tmp_path):
     (tmp_path / REFERENCE_FILE).write_text('{"data_return": 2.0, "actor": null, "path_error": null}')
     assert Reference.read(tmp_path) == Reference(2.0)
 
 
-def test_a_reference_is_kept_in_the_run_and_an_actor_that_ships_no_more_is_unknown(tmp_path):
-    assert Reference.read(tmp_path) == Reference(), "earlier versions kept none"
+def test_reference_round_trip_and_retired_actor(tmp_path):
+    assert Reference.read(tmp_path) == Reference(), "earlier versions stored none"
     reference = Reference.of(
         open_dataset(write_fake_set(tmp_path / "set", attributes={"task": "walker_walk", "actor_sha256": EXPERT}))
     ).with_path_error(0.12345678)
@@ -77,7 +77,7 @@ def test_a_reference_is_kept_in_the_run_and_an_actor_that_ships_no_more_is_unkno
     ],
     ids=str,
 )
-def test_a_damaged_reference_is_one_line(tmp_path, change):
+def test_damaged_reference_is_rejected(tmp_path, change):
     Reference(1.0, ACTOR, 0.5).write(tmp_path)
     whole = json.loads((tmp_path / REFERENCE_FILE).read_text())
     (tmp_path / REFERENCE_FILE).write_text(json.dumps({} if change is None else whole | change))
@@ -86,7 +86,7 @@ def test_a_damaged_reference_is_one_line(tmp_path, change):
     assert "\n" not in str(caught.value)
 
 
-def test_a_summary_counts_episodes_above_four_fifths_of_the_datas_return():
+def test_summary_counts_episodes_above_80_percent_of_data_return():
     rows = [
         {"return": total, "score": total / 10, "action_error": error}
         for total, error in ((90.0, 0.2), (80.0, 0.4), (100.0, None))
@@ -101,5 +101,5 @@ def test_a_summary_counts_episodes_above_four_fifths_of_the_datas_return():
         "action_error": pytest.approx(0.3),
     }
     assert summarise(rows[2:], Reference())["share_above_80"] is None
-    assert summarise(rows[2:], Reference(data_return=-5.0))["share_above_80"] is None, "80% of what is lost is no aim"
+    assert summarise(rows[2:], Reference(data_return=-5.0))["share_above_80"] is None, "undefined for a negative return"
     assert summarise(rows[2:], Reference())["action_error"] is None

@@ -24,14 +24,14 @@ def cache(tmp_path):
 
 
 def last_bits_changed(reward):
-    """The same rewards as another processor computes them: one unit in the last place of a float64 away."""
+    """The rewards with an error of one float64 ulp, as another processor may compute them."""
     changed = np.nextafter(reward, np.inf)
     assert (changed != reward).all()
     return changed
 
 
 def slow_frames(log, seconds):
-    """`read_frames` that notes every call in a file and takes its time after every block."""
+    """`read_frames` that logs every call and sleeps after every block."""
 
     def read(path, original=store_module.read_frames):
         with log.open("a") as file:
@@ -47,7 +47,7 @@ def visible(cache):
     return sorted(p.name for p in cache.iterdir() if p.suffix != ".lock")
 
 
-def test_decoded_arrays_are_the_concatenated_rows(tmp_path, cache):
+def test_decoded_arrays_concatenate_shards(tmp_path, cache):
     rows = fake_rows((5, 4, 6), physics_dim=3)
     store = open_store(write_fake_set(tmp_path / "set", (5, 4, 6), physics_dim=3, cuts=(3, 11)), cache)
     np.testing.assert_array_equal(store.frames(), rows["observation"])
@@ -58,7 +58,7 @@ def test_decoded_arrays_are_the_concatenated_rows(tmp_path, cache):
     assert store.meta["shards"] == ["0_fake.hdf5", "1_fake.hdf5", "2_fake.hdf5"]
 
 
-def test_a_changed_set_is_decoded_anew(tmp_path, cache):
+def test_changed_set_is_decoded_again(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (4,))
     before = open_store(folder, cache)
     write_shard(folder / "1_fake.hdf5", fake_rows((3,)), {})
@@ -67,13 +67,13 @@ def test_a_changed_set_is_decoded_anew(tmp_path, cache):
     assert before.fingerprint != after.fingerprint
 
 
-def test_the_fingerprint_names_the_content(tmp_path, cache):
+def test_fingerprint_depends_on_content(tmp_path, cache):
     one, two, other = (write_fake_set(tmp_path / n, (4,), action_dim=d) for n, d in (("a", 2), ("b", 2), ("c", 3)))
     assert open_store(one, cache).fingerprint == open_store(two, cache).fingerprint
     assert open_store(one, cache).fingerprint != open_store(other, cache).fingerprint
 
 
-def test_the_fingerprint_reads_rewards_as_training_does(tmp_path, cache):
+def test_fingerprint_hashes_rewards_as_float32(tmp_path, cache):
     def name(folder, reward):
         (tmp_path / folder).mkdir()
         write_shard(tmp_path / folder / "0_fake.hdf5", rows | {"reward": reward}, {})
@@ -85,7 +85,7 @@ def test_the_fingerprint_reads_rewards_as_training_does(tmp_path, cache):
     assert name("three", np.nextafter(reward.astype(np.float32), np.inf, dtype=np.float32)) != name("four", reward)
 
 
-def test_the_cache_folder_follows_the_environment(tmp_path, monkeypatch):
+def test_cache_folder_follows_environment_variables(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("VD4RL_POMDP_CACHE", raising=False)
     assert default_cache() == tmp_path / "xdg" / "vd4rl-pomdp"
@@ -94,7 +94,7 @@ def test_the_cache_folder_follows_the_environment(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["frames.u8", "reward.npy"])
-def test_verify_finds_a_flipped_byte_and_open_a_short_file(tmp_path, cache, name):
+def test_store_detects_flipped_byte_and_short_file(tmp_path, cache, name):
     folder = write_fake_set(tmp_path / "set")
     store = open_store(folder, cache)
     verify_store(store)
@@ -104,10 +104,10 @@ def test_verify_finds_a_flipped_byte_and_open_a_short_file(tmp_path, cache, name
     with pytest.raises(UserError, match=rf"{name}: is damaged; delete"):
         verify_store(store)
     (store.folder / name).write_bytes(content[:-1])
-    verify_store(open_store(folder, cache))  # decoded anew
+    verify_store(open_store(folder, cache))  # decodes again
 
 
-def test_two_processes_decode_once_and_agree(tmp_path, cache, monkeypatch):
+def test_concurrent_processes_decode_once(tmp_path, cache, monkeypatch):
     folder = write_fake_set(tmp_path / "set", (5, 4), cuts=(3,))
     log = tmp_path / "log"
     monkeypatch.setattr(store_module, "read_frames", slow_frames(log, 0.2))
@@ -119,7 +119,7 @@ def test_two_processes_decode_once_and_agree(tmp_path, cache, monkeypatch):
     assert visible(cache) == [stores[0].folder.name]
 
 
-def test_a_killed_decode_leaves_nothing_that_counts(tmp_path, cache, monkeypatch):
+def test_killed_decode_is_repeated(tmp_path, cache, monkeypatch):
     folder = write_fake_set(tmp_path / "set", (5, 4), cuts=(3,))
     log = tmp_path / "log"
     with monkeypatch.context() as patch:
@@ -131,14 +131,14 @@ def test_a_killed_decode_leaves_nothing_that_counts(tmp_path, cache, monkeypatch
     assert process.pid
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    assert [name[0] for name in visible(cache)] == ["."], "only the hidden folder may be there"
+    assert [name[0] for name in visible(cache)] == ["."], "only a hidden folder may exist"
     store = open_store(folder, cache)
     verify_store(store)
     assert visible(cache) == [store.folder.name]
 
 
 @pytest.mark.parametrize("stage", ["_write_frames", "_checksum"])
-def test_a_full_disk_removes_what_was_written(tmp_path, cache, monkeypatch, stage):
+def test_full_disk_leaves_empty_cache(tmp_path, cache, monkeypatch, stage):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -148,7 +148,7 @@ def test_a_full_disk_removes_what_was_written(tmp_path, cache, monkeypatch, stag
     assert visible(cache) == []
 
 
-def test_too_little_space_is_told_before_decoding(tmp_path, cache, monkeypatch):
+def test_insufficient_space_is_reported_before_decoding(tmp_path, cache, monkeypatch):
     monkeypatch.setattr(store_module.shutil, "disk_usage", lambda _: type("usage", (), {"free": 8 * 21168 - 1}))
     with pytest.raises(
         UserError, match=r"decoding needs 0\.000169344 GB, the disk has 0\.000169343 GB; .*VD4RL_POMDP_CACHE"
@@ -157,7 +157,7 @@ def test_too_little_space_is_told_before_decoding(tmp_path, cache, monkeypatch):
     assert visible(cache) == []
 
 
-def test_a_cache_on_a_disk_that_locks_no_files_is_told(tmp_path, cache, monkeypatch):
+def test_cache_without_file_locks_is_rejected(tmp_path, cache, monkeypatch):
     def refuse(*arguments):
         raise OSError(38, "Function not implemented")
 
@@ -171,7 +171,7 @@ def set_step_type(path, row, value):
         file["step_type"][row] = value
 
 
-def test_rows_that_belong_to_no_episode_are_named(tmp_path, cache):
+def test_rows_outside_episodes_are_rejected(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (4, 4, 4), cuts=(6,))
     set_step_type(folder / "1_fake.hdf5", 2, 1)  # row 8, the third episode's first
     with pytest.raises(UserError, match=r"1_fake\.hdf5: row 2 follows an episode's last row without beginning"):
@@ -182,14 +182,14 @@ def test_rows_that_belong_to_no_episode_are_named(tmp_path, cache):
     assert not cache.exists() or visible(cache) == []
 
 
-def test_a_shard_missing_inside_an_episode_is_found(tmp_path, cache):
+def test_shard_missing_within_episode_is_rejected(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (9,), cuts=(3, 6), names=["0_a.hdf5", "1_a.hdf5", "0_b.hdf5"])
     (folder / "1_a.hdf5").unlink()
     with pytest.raises(UserError, match=r"0_b\.hdf5: row 0 continues an episode, but not that of 0_a\.hdf5"):
         open_store(folder, cache)
 
 
-def test_the_first_shards_of_a_set_may_be_used_and_any_single_one(tmp_path, cache):
+def test_leading_shards_or_single_shard_are_opened(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (3, 3, 3), cuts=(3, 6))
     (folder / "2_fake.hdf5").unlink()
     for path, episodes in ((folder, (0, 1)), (folder / "1_fake.hdf5", (1,))):
@@ -198,7 +198,7 @@ def test_the_first_shards_of_a_set_may_be_used_and_any_single_one(tmp_path, cach
 
 
 @pytest.mark.parametrize("unit", ["episodes", "trajectories"])
-def test_a_collected_set_that_lacks_episodes_is_refused(tmp_path, cache, unit):
+def test_collected_set_with_missing_episodes_is_rejected(tmp_path, cache, unit):
     folder = write_fake_set(tmp_path / "set", (3, 3, 3), cuts=(3, 6))
     write_json(folder / "collection.json", {unit: 3})
     write_json(folder / "provenance.json", {})
@@ -206,7 +206,7 @@ def test_a_collected_set_that_lacks_episodes_is_refused(tmp_path, cache, unit):
     (folder / "2_fake.hdf5").unlink()
     with pytest.raises(UserError, match=r"set: holds 2 episodes, its collection\.json says 3: is a shard missing"):
         open_store(folder, cache)
-    assert open_store(folder / "1_fake.hdf5", cache).meta["rows"] == 3, "one shard is no set"
+    assert open_store(folder / "1_fake.hdf5", cache).meta["rows"] == 3, "a single shard may be opened"
     assert open_store(folder / "0_fake.hdf5", cache).meta["rows"] == 3
     (folder / "1_fake.hdf5").unlink()
     with pytest.raises(UserError, match="holds 1 episodes"):
@@ -221,7 +221,7 @@ def test_a_collected_set_that_lacks_episodes_is_refused(tmp_path, cache, unit):
         ({}, r"0_a\.hdf5: has 'physics' and 0_b\.hdf5 does not"),
     ],
 )
-def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):
+def test_shards_of_different_sets_are_rejected(tmp_path, cache, second, message):
     write_fake_set(tmp_path / "set", (4,), physics_dim=3, names=["0_a.hdf5"])
     write_fake_set(tmp_path / "set", (4,), names=["0_b.hdf5"], **second)
     with pytest.raises(UserError, match=message):
@@ -229,7 +229,7 @@ def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):
 
 
 def with_frames(folder, size, number=0):
-    """Write a shard of one episode whose frames have another size."""
+    """Write a shard of one episode with `size` x `size` frames."""
     rows = fake_rows([6])
     rows["observation"] = np.random.default_rng(size).integers(0, 256, (6, 3, size, size), dtype=np.uint8)
     folder.mkdir(exist_ok=True)
@@ -238,13 +238,13 @@ def with_frames(folder, size, number=0):
 
 
 @pytest.mark.parametrize("size", [16, 64, 100, 480])
-def test_the_shards_tell_the_size_of_the_frames(tmp_path, size):
+def test_frame_size_is_read_from_shards(tmp_path, size):
     frames = with_frames(tmp_path / "set", size)
     for _ in range(2):
         np.testing.assert_array_equal(open_store(tmp_path / "set", tmp_path / "cache").frames(), frames)
 
 
-def test_shards_of_two_frame_sizes_are_refused(tmp_path):
+def test_shards_of_mixed_frame_sizes_are_rejected(tmp_path):
     with_frames(tmp_path / "set", 84)
     with_frames(tmp_path / "set", 64, number=1)
     with pytest.raises(
@@ -254,7 +254,7 @@ def test_shards_of_two_frame_sizes_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("size", [15, 481])
-def test_frames_that_nothing_reads_are_refused(tmp_path, size):
+def test_unsupported_frame_sizes_are_rejected(tmp_path, size):
     with_frames(tmp_path / "set", size)
     with pytest.raises(UserError, match=r"square uint8 frames \(N, 3, S, S\) of 16 to 480 pixels"):
         open_store(tmp_path / "set", tmp_path / "cache")

@@ -1,4 +1,4 @@
-"""One view of the data: what an agent sees, batch after batch, and the names that the time axis has."""
+"""A view of the data: observations batch by batch, random streams and row keys."""
 
 import pytest
 import torch
@@ -28,7 +28,7 @@ MAKE = {
 
 
 @pytest.mark.parametrize("kind", MAKE)
-def test_a_samplers_state_is_all_that_its_next_batches_depend_on(dataset, kind):
+def test_sampler_state_determines_next_batches(dataset, kind):
     def sampler():
         return MAKE[kind](View(dataset, CorruptionConfig.of("patch+zero_frames"), 4, 3, "test"))
 
@@ -42,7 +42,7 @@ def test_a_samplers_state_is_all_that_its_next_batches_depend_on(dataset, kind):
     assert not torch.equal(sampler().sample().obs, one.obs)
 
 
-def test_views_of_different_names_draw_apart_and_of_one_name_alike(dataset):
+def test_view_name_determines_random_stream(dataset):
     rows = torch.arange(8)
     config = CorruptionConfig.of("patch+zero_frames")
     seen = [View(dataset, config, 4, 0, *name).observe(rows) for name in (["a"], ["a"], ["b"], ["a", 1])]
@@ -51,7 +51,7 @@ def test_views_of_different_names_draw_apart_and_of_one_name_alike(dataset):
     assert not torch.equal(seen[0], seen[3])
 
 
-def test_a_window_is_shifted_as_one_and_the_next_one_anew(dataset):
+def test_window_shares_one_random_shift(dataset):
     dataset.frames = torch.randint(
         0, 256, dataset.frames.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
     )
@@ -65,8 +65,8 @@ def test_a_window_is_shifted_as_one_and_the_next_one_anew(dataset):
 
 @pytest.mark.parametrize("corruption", ["none", "zero_frames"])
 @pytest.mark.parametrize("by_lines", [True, False])
-def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeypatch, corruption, by_lines):
-    """The frames of one observation still share a shift, and the two ways to shift agree."""
+def test_observations_can_be_shifted_independently(dataset, monkeypatch, corruption, by_lines):
+    """The frames of one observation still share a shift, and both implementations agree."""
     dataset.frames = torch.randint(
         0, 256, dataset.frames.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
     )
@@ -76,15 +76,15 @@ def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeyp
     rows = torch.tensor([[2, 2, 2], [2, 3, 2]])
     seen = view.observe(rows).clone()
     keys = KeyStream(stream_seed(0, "shift")).take((6,))
-    alone = View(dataset, CorruptionConfig.of(corruption), 4).observe(rows.flatten(), keys)
-    assert torch.equal(seen.flatten(0, 1), alone)
+    flat = View(dataset, CorruptionConfig.of(corruption), 4).observe(rows.flatten(), keys)
+    assert torch.equal(seen.flatten(0, 1), flat)
     if corruption == "none":
         same = [torch.equal(seen[0, 0], other) for other in (seen[0, 1], seen[0, 2], seen[1, 0], seen[1, 2])]
         assert same.count(True) <= 1
-    assert not torch.equal(view.observe(rows), seen), "the next ones are others"
+    assert not torch.equal(view.observe(rows), seen), "the next shifts differ"
 
 
-def test_row_keys_unpack_and_padding_is_not_real(dataset):
+def test_row_keys_unpack_and_padding_is_masked(dataset):
     episode, t = torch.tensor([0, 3, 70_000]), torch.tensor([0, 500, 1_000_000])
     assert [x.tolist() for x in unpack_row_key(row_key(episode, t))] == [episode.tolist(), t.tolist()]
     window = View(dataset).windows([0, 1], 4).replace(length=torch.tensor([4, 2]))
@@ -92,7 +92,7 @@ def test_row_keys_unpack_and_padding_is_not_real(dataset):
 
 
 @pytest.mark.parametrize("shift", [0, 4])
-def test_a_batch_may_be_empty(dataset, shift):
+def test_empty_batches_have_shapes(dataset, shift):
     view = View(dataset, CorruptionConfig.of("patch+zero_frames"), shift)
     assert view.transitions([]).obs.shape == (0, 9, 84, 84)
     assert view.windows([], 3).obs.shape == (0, 3, 9, 84, 84)

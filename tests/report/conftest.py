@@ -1,4 +1,4 @@
-"""Figures are drawn where a test asks for them."""
+"""Figures are drawn only for tests that request them."""
 
 import pytest
 
@@ -8,12 +8,12 @@ from vd4rl_pomdp.report import figures
 
 @pytest.fixture
 def drawn() -> None:
-    """A test with this one gets figures, in the page alone."""
+    """Draw figures in the page, but write no figure files."""
 
 
 @pytest.fixture
 def figure_files() -> None:
-    """A test with this one gets the files of figures, too."""
+    """Draw figures and write their files."""
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""The page that browses a set: what it holds is the set's and the corruption's own, read from the page alone."""
+"""The dataset viewer's page holds the frames, corruptions, actions and rewards of the dataset."""
 
 import base64
 import io
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def noisy_set(folder: Path, lengths: list[int], size: int) -> Path:
-    """Random pixels: nothing is like what was before, and little can be compressed."""
+    """A set with random pixels: all frames differ and compress poorly."""
     rows, draw = fake_rows(lengths), np.random.default_rng(0)
     rows["observation"] = draw.integers(1, 256, (sum(lengths), 3, size, size), np.uint8)
     folder.mkdir(parents=True)
@@ -41,7 +41,7 @@ def pixels(sheet: str, content: dict, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("size", "every"), [(32, 1), (150, 2)])
-def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_set(tmp_path, size, every):
+def test_viewer_shows_corrupted_frames_and_stored_curves(tmp_path, size, every):
     folder = noisy_set(tmp_path / "walker_walk" / "expert", [7, 1, 12], size)
     words = ["--corruption", "patch+zero_frames", "--patch-fill", "9", "--zeroed-frames", "1", "--seed", "3"]
     main(["data", "view", str(folder), "--out", str(tmp_path / "new" / "view.html"), *words])
@@ -52,7 +52,7 @@ def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_
     for episode in content["episodes"]:
         rows = data.rows_of(episode["number"]).start + torch.tensor(episode["rows"])
         key = torch.tensor(list(map(int, episode["keys"])))
-        assert torch.equal(key, derive_keys(pretraining.stream.seed, data.keys(rows))), "what runs of this seed see"
+        assert torch.equal(key, derive_keys(pretraining.stream.seed, data.keys(rows))), "as runs of this seed"
         stacks = View(data).stacks(rows)
         clean, seen = (
             x.reshape(-1, 3, size, size)[..., ::every, ::every].permute(0, 2, 3, 1).numpy()
@@ -62,7 +62,7 @@ def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_
         assert np.array_equal(np.where(over[..., 3:] > 0, over[..., :3], clean), seen)
         frames = pixels(episode["clean"], content, max(map(max, episode["frames"])) + 1)
         lossy = frames[np.array(episode["frames"]).flatten()].astype(float)
-        assert np.corrcoef(lossy.flatten(), clean.flatten())[0, 1] > 0.5, "noise, at a low quality"
+        assert np.corrcoef(lossy.flatten(), clean.flatten())[0, 1] > 0.5, "noise at low image quality"
         for name, values in (("action", data.action), ("reward", data.reward[:, None])):
             low, high = content[name]
             shown = np.frombuffer(base64.b64decode(episode[name]), np.uint8).reshape(values.shape[1], -1)
@@ -70,7 +70,7 @@ def test_corrupted_frames_are_those_of_the_printed_keys_and_curves_those_of_the_
             np.testing.assert_allclose(low + shown / 255 * (high - low), stored, atol=(high - low) / 500)
 
 
-def test_a_hundred_episodes_fit_in_5_MB_and_need_no_network(tmp_path):
+def test_viewer_page_fits_5_MB_and_needs_no_network(tmp_path):
     folder = noisy_set(tmp_path / "cheetah_run" / "random", [40] * 120, 48)
     main(["data", "view", str(folder), "--out", str(tmp_path / "view.html")])
     page, content = (tmp_path / "view.html").read_text(), content_of(tmp_path / "view.html")
@@ -87,11 +87,11 @@ def _data(page: str) -> tuple[str, str]:
     return re.search(r'id="content">(.*?)</script>', page)[1], ""
 
 
-def test_a_page_replaces_a_page_and_nothing_else(tmp_path, capsys):
+def test_viewer_overwrites_only_its_own_page(tmp_path, capsys):
     folder, out = noisy_set(tmp_path / "walker_walk" / "expert", [5], 16), tmp_path / "view.html"
     for corruption in ("patch", "none"):
         main(["data", "view", str(folder), "--out", str(out), "--corruption", corruption])
-    assert 'id="on"' not in out.read_text(), "there is nothing to switch"
+    assert 'id="on"' not in out.read_text(), "no switch without corruption"
     out.write_text("mine")
     for place in (out, tmp_path, folder / "view.html"):
         with pytest.raises(SystemExit) as ended:

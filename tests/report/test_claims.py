@@ -1,4 +1,4 @@
-"""What becomes of the paper's claims, on runs whose returns are given."""
+"""Verdicts on the paper's claims, on runs with given returns."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ GOOD = {
     ("random", "patch"): (10, 14),
     ("supervised+a", "patch"): (70, 71),
 }
-"""Scores of two seeds of every method under a corruption: a tenth of their returns."""
+"""Scores (return / 10) of two seeds by method and corruption."""
 MEMORY, GRU, ACTIONS, BOTH, OVER_AH, OVER_FJ, FIRST, CLEAN = (claim.text for claim in CLAIMS[1:9])
 
 
@@ -37,7 +37,7 @@ def judged(folder: Path) -> dict[str, dict[str, Any]]:
     return {row["claim"]: row for row in judge_claims(load_runs([folder]))}
 
 
-def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
+def test_claims_are_differences_of_means_with_intervals(tmp_path):
     rows = judged(write(tmp_path, GOOD))
     shown = {claim: (round(row["left_return"]), round(row["right_return"])) for claim, row in rows.items()}
     assert shown == {
@@ -56,7 +56,7 @@ def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
     assert [row["verdict"] for row in rows.values()] == ["holds"] * 5 + ["not refuted", "", ""]
 
 
-def test_episodes_are_paired_by_their_numbers_and_not_by_their_lines(tmp_path):
+def test_episodes_are_paired_by_number(tmp_path):
     returns = {"mik": (30.0, 55.0, 41.0, 72.0), "acro": (44.0, 21.0, 63.0, 30.0)}
     for method, scores in returns.items():
         for seed in range(2):
@@ -91,12 +91,12 @@ def test_episodes_are_paired_by_their_numbers_and_not_by_their_lines(tmp_path):
         ({("acro", "none"): (60,)}, CLEAN, "too few seeds"),
     ],
 )
-def test_what_an_interval_leaves_out_is_told(tmp_path, changes, claim, verdict):
+def test_claim_verdict_follows_from_interval(tmp_path, changes, claim, verdict):
     assert judged(write(tmp_path, GOOD | changes))[claim]["verdict"] == verdict
 
 
-def test_claims_of_a_family_are_tested_together_and_others_by_themselves(tmp_path):
-    """Four primary contrasts; two of the second family; what is judged differently by its own p value."""
+def test_holm_correction_applies_within_claim_families(tmp_path):
+    """Four primary contrasts, two of the second family, and an exploratory one without adjustment."""
     scores = {
         **{("acro", "patch"): (20, 22, 24), ("mik", "patch"): (27, 34, 33), ("mik+a", "patch"): (38, 44, 47)},
         **{("ah+a", "patch"): (33, 37, 36), ("fj+a", "patch"): (30, 31, 32), ("acro", "none"): (27, 31, 32)},
@@ -122,10 +122,10 @@ def test_claims_of_a_family_are_tested_together_and_others_by_themselves(tmp_pat
     assert (seen["family"], seen["adjusted_p"]) == ("exploratory", None)
     assert seen["p"] == pytest.approx(p("acro", "acro", "none"))
     assert (rows[MEMORY]["verdict"], seen["verdict"]) == ("undecided", "holds")
-    assert rows[MEMORY]["p"] < 0.05 < rows[MEMORY]["adjusted_p"], "it would hold alone"
+    assert rows[MEMORY]["p"] < 0.05 < rows[MEMORY]["adjusted_p"], "it would hold without adjustment"
 
 
-def test_the_smallest_difference_that_would_be_found_is_told_beside_the_datas_return(tmp_path):
+def test_report_shows_smallest_detectable_difference(tmp_path):
     row = judged(write(tmp_path / "runs", GOOD))[MEMORY]
     error, free = (200 / 2 + 200 / 2) ** 0.5, 2
     expected = (scipy.stats.t.ppf(0.975, free) + scipy.stats.t.ppf(0.8, free)) * error
@@ -137,7 +137,7 @@ def test_the_smallest_difference_that_would_be_found_is_told_beside_the_datas_re
 
 
 def on_own_sets(folder: Path, first: int = 100) -> None:
-    """Give every run a set of its seed, each collected with a seed of its own."""
+    """Give every run a dataset collected with `first` + its seed."""
     for run in folder.iterdir():
         record = read_json(run / "config.json")
         seed = record["config"]["seed"]
@@ -145,7 +145,7 @@ def on_own_sets(folder: Path, first: int = 100) -> None:
         write_json(run / "config.json", record | made)
 
 
-def test_seeds_on_sets_of_their_own_are_like_with_like(tmp_path):
+def test_seeds_with_individual_sets_are_compared(tmp_path):
     on_own_sets(write(tmp_path / "one", GOOD))
     assert judged(tmp_path / "one")[BOTH]["verdict"] == "holds"
     on_own_sets(write(tmp_path / "two" / "acro", {("acro", "patch"): (20, 22)}))
@@ -153,10 +153,10 @@ def test_seeds_on_sets_of_their_own_are_like_with_like(tmp_path):
     assert judged(tmp_path / "two")[BOTH]["verdict"] == "not judged: other data"
 
 
-def test_a_claim_is_told_of_the_same_policies_played_clean_too(tmp_path):
-    """What is hidden at evaluation is a choice of its own, and a claim may turn with it."""
+def test_claims_include_clean_evaluations(tmp_path):
+    """A claim may reverse when the same policies are evaluated without corruption."""
     write(tmp_path, GOOD)
-    assert judged(tmp_path)[MEMORY]["clean_difference"] is None, "nobody was played clean"
+    assert judged(tmp_path)[MEMORY]["clean_difference"] is None, "no clean evaluations yet"
     for method, score in (("mik", 10), ("acro", 50)):
         for seed in (0, 1):
             run = tmp_path / f"{method}-patch-{seed}-td3_bc"
@@ -170,17 +170,17 @@ def test_a_claim_is_told_of_the_same_policies_played_clean_too(tmp_path):
     assert "-400 [-430, -370]" in page
 
 
-def test_claims_are_about_methods_as_they_are_and_not_about_their_variants(tmp_path):
+def test_claims_ignore_variants_of_methods(tmp_path):
     write(tmp_path, GOOD)
     write(tmp_path, {("acro", "patch"): (40, 42)}, history="gru")
     rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, random_histories=0.5))
     assert rows[MEMORY]["right_return"] == pytest.approx(210)
     assert rows[ACTIONS]["left_return"] == pytest.approx(520)
     assert rows[GRU]["left_return"] == pytest.approx(410)
-    assert "history gru" in rows[FIRST]["right"], "the best other one, whatever its variant"
+    assert "history gru" in rows[FIRST]["right"], "the best other method may be a variant"
 
 
-def test_runs_of_like_settings_are_compared_and_not_the_best_of_each_side(tmp_path):
+def test_claims_compare_runs_of_equal_settings(tmp_path):
     write(tmp_path, GOOD)
     rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92), ("driml", "patch"): (95, 97)}, steps=60))
     assert (rows[ACTIONS]["left_return"], rows[ACTIONS]["right_return"]) == pytest.approx((520, 320))
@@ -191,7 +191,7 @@ def test_runs_of_like_settings_are_compared_and_not_the_best_of_each_side(tmp_pa
     ("settings", "words"),
     [({"steps": 60, "max_k": 1}, "steps, max_k"), ({"steps": 60, "preset": "paper"}, "pretraining preset")],
 )
-def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, settings, words):
+def test_claims_without_equal_settings_are_not_judged(tmp_path, settings, words):
     write(tmp_path, GOOD | {("mik+a", "patch"): (), ("mik+a", "none"): ()})
     rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, **settings))
     for claim in (ACTIONS, FIRST, "what a memory trained on the states adds"):
@@ -203,7 +203,7 @@ def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, s
     assert (states["verdict"], states["difference"]) == ("", pytest.approx(760 - 910)), "states are not pretrained"
 
 
-def test_seeds_that_share_an_encoder_are_not_judged(tmp_path):
+def test_seeds_that_share_an_encoder_are_excluded(tmp_path):
     write(tmp_path, GOOD | {("driml", "patch"): (80, 82)})
     for run in tmp_path.glob("driml-patch-*"):
         card = read_json(run / "encoder" / "config.json")
@@ -211,7 +211,7 @@ def test_seeds_that_share_an_encoder_are_not_judged(tmp_path):
     assert judged(tmp_path)[FIRST]["right"] == "mik"
 
 
-def test_a_setting_that_early_runs_do_not_record_is_the_methods_own(tmp_path):
+def test_unrecorded_history_counts_as_the_methods_default(tmp_path):
     for seed in (0, 1):
         describe(write_run(tmp_path / f"acro{seed}", "acro", seed, {10: [20.0 + seed]}), seed=seed)
     assert judged(tmp_path) == {}, "no acro with a GRU was run"
@@ -220,23 +220,23 @@ def test_a_setting_that_early_runs_do_not_record_is_the_methods_own(tmp_path):
 @pytest.mark.parametrize(
     ("moved", "verdict"), [(0.05, "undecided at this budget"), (None, "convergence is not recorded")]
 )
-def test_nothing_is_judged_unless_the_critics_of_both_sides_are_known_to_have_converged(tmp_path, moved, verdict):
+def test_claims_require_converged_critics(tmp_path, moved, verdict):
     write(tmp_path, GOOD | {("mik", "patch"): ()})
     rows = judged(write(tmp_path, {("mik", "patch"): GOOD["mik", "patch"]}, moved=moved))
     for claim in (MEMORY, ACTIONS, FIRST):
         assert rows[claim]["verdict"] == f"not judged: {verdict}"
-        assert rows[claim]["low"] < rows[claim]["difference"] < rows[claim]["high"], "told all the same"
-    assert rows["acro returns less where pixels are hidden"]["verdict"] == "holds", "mik is none of it"
+        assert rows[claim]["low"] < rows[claim]["difference"] < rows[claim]["high"], "the interval is still given"
+    assert rows["acro returns less where pixels are hidden"]["verdict"] == "holds", "does not involve mik"
 
 
-def test_a_claim_against_every_method_rests_on_each(tmp_path):
+def test_claim_against_all_methods_requires_each_critic(tmp_path):
     write(tmp_path, GOOD)
     rows = judged(write(tmp_path, {("driml", "patch"): (20, 22)}, moved=0.05))
     assert (rows[FIRST]["right"], rows[FIRST]["verdict"]) == ("driml", "not judged: undecided at this budget")
     assert rows[ACTIONS]["verdict"] == "holds"
 
 
-def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, capsys):
+def test_page_and_terminal_show_claims(tmp_path, capsys):
     write(tmp_path / "runs", GOOD | {("mik", "patch"): (60,)})
     report = write_report([tmp_path / "runs"], tmp_path / "out")
     page = report.page.read_text()
@@ -246,12 +246,12 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert "400 [339, 461]" in (tmp_path / "out" / "claims.tex").read_text()
     print_summary(report)
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, "one seed of mik is higher"
+    assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, "mik's one seed is higher"
     assert f"{ACTIONS} (primary): holds in 0 of 1 setting; too few seeds in 1" in shown
     assert "told the states" not in shown
 
 
-def test_the_tally_counts_unjudged_settings_once_and_by_reason():
+def test_tally_counts_unjudged_settings_by_reason():
     verdicts = ["not judged: other data", "undecided", "holds", "not judged: other data", "not judged: other readout"]
     rows = [{"kind": "above", "verdict": verdict} for verdict in verdicts]
     assert tally(rows) == "holds in 1 of 5 settings; undecided in 1; not judged in 3 (2 other data, 1 other readout)"

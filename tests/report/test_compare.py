@@ -1,4 +1,4 @@
-"""Two result sets side by side."""
+"""`report compare`: two result sets side by side."""
 
 import csv
 from pathlib import Path
@@ -13,7 +13,7 @@ from vd4rl_pomdp.runs.results import add_results
 
 
 def two_sets(folder: Path) -> tuple[Path, Path]:
-    """Two seeds of acro in both, longer pretrained in the second; mik+a in the first, curl in the second alone."""
+    """Two seeds of acro in both, pretrained longer in B; mik+a only in A, curl only in B."""
     for seed in (0, 1):
         describe(write_run(folder / f"a/acro{seed}", "acro", seed, {5: [90.0], 10: [20.0 + seed]}), {})
         describe(write_run(folder / f"b/acro{seed}", "acro", seed, {10: [26.0 + seed]}), {"steps": 60}, views=1)
@@ -23,7 +23,7 @@ def two_sets(folder: Path) -> tuple[Path, Path]:
     return folder / "a", folder / "b"
 
 
-def test_conditions_are_told_side_by_side_with_what_differs(tmp_path):
+def test_compare_lists_conditions_with_differing_settings(tmp_path):
     found = compare_results(*two_sets(tmp_path))
     acro, curl, mik = found.rows
     assert (acro["score_a"], acro["score_b"], acro["difference"]) == (20.5, 26.5, 6.0)
@@ -37,7 +37,7 @@ def test_conditions_are_told_side_by_side_with_what_differs(tmp_path):
     assert [side["others"] for side in found.sides] == [0, 1], "an unfinished run has no score"
 
 
-def test_a_set_against_itself_differs_in_nothing(tmp_path):
+def test_comparing_a_set_with_itself_shows_no_difference(tmp_path):
     runs, _ = two_sets(tmp_path)
     add_results([runs], tmp_path / "rows")
     for row in compare_results(runs, tmp_path / "rows").rows:
@@ -45,7 +45,7 @@ def test_a_set_against_itself_differs_in_nothing(tmp_path):
         assert row["score_a"] == row["score_b"]
 
 
-def test_variants_are_compared_by_name_and_a_lone_one_with_the_other_sets(tmp_path):
+def test_variants_are_matched_by_name_or_as_single_candidates(tmp_path):
     for k in (1, 15):
         describe(write_run(tmp_path / f"a/{k}", "mik+a", 0, {10: [k]}), {"max_k": k})
         describe(write_run(tmp_path / f"b/{k}", "mik+a", 0, {10: [2.0 * k]}), {"max_k": k})
@@ -57,10 +57,10 @@ def test_variants_are_compared_by_name_and_a_lone_one_with_the_other_sets(tmp_pa
     assert {row["variant"]: row["difference"] for row in some} == {"max_k 1": 1.0, "max_k 15": None}
     describe(write_run(tmp_path / "c", "mik+a", 0, {10: [9.0]}), {"max_k": 30})
     other = compare_results(tmp_path / "a", tmp_path / "c").rows
-    assert [row["difference"] for row in other] == [None] * 3, "which of two it is compared with is not told"
+    assert [row["difference"] for row in other] == [None] * 3, "two candidates are ambiguous"
 
 
-def test_equal_settings_are_compared_however_each_set_names_them(tmp_path):
+def test_equal_settings_match_under_different_labels(tmp_path):
     for size in (16, 48):
         for seed in (0, 1):
             run = write_run(tmp_path / f"a/{size}/{seed}", "acro", seed, {10: [size + seed]})
@@ -72,7 +72,7 @@ def test_equal_settings_are_compared_however_each_set_names_them(tmp_path):
     assert [row["difference"] for row in back if row["corruption"] == "patch"] == [0.0]
 
 
-def test_the_command_prints_and_writes_a_page(tmp_path, capsys):
+def test_compare_command_prints_and_writes_page(tmp_path, capsys):
     a, b = two_sets(tmp_path)
     main(["report", "compare", str(a), str(b), "--out", str(tmp_path / "out")])
     shown = capsys.readouterr().out
@@ -98,7 +98,7 @@ def test_the_command_prints_and_writes_a_page(tmp_path, capsys):
         (["a", "b", "--out", "a"], "choose another --out"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path, capsys, monkeypatch, words, message):
+def test_invalid_comparisons_are_rejected(tmp_path, capsys, monkeypatch, words, message):
     two_sets(tmp_path)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as end:

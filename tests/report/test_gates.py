@@ -1,4 +1,4 @@
-"""Whether a setting can tell methods apart, on runs whose returns are given."""
+"""Gates that decide whether a setting discriminates between methods, on runs with given returns."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ GOOD = {
     ("random", "patch"): (10, 14),
     ("supervised+a", "patch"): (70, 71),
 }
-"""Scores of two seeds of every method under a corruption: a tenth of their returns."""
+"""Scores (return / 10) of two seeds by method and corruption."""
 UNDECIDED, UNKNOWN = "undecided at this budget", "not known to discriminate"
 ABOVE_RANDOM = tuple(scipy.stats.ttest_ind([500, 540], [100, 140]).confidence_interval(0.95))
 
@@ -39,13 +39,13 @@ def gate(folder: Path, corruption: str) -> dict[str, Any]:
 
 
 def move(folder: Path, method: str, corruption: str, moved: float | None) -> None:
-    """Let the critics of a method's runs end with a share of their value by which they moved."""
+    """Set the relative movement of the critics of a method's runs."""
     for run in folder.glob(f"{method}-{corruption}-*"):
         write_json(run / "critic.json", {"value": 150.0, "moved": moved, "data": 160.0})
 
 
 def methods(summary: pd.DataFrame) -> list[str]:
-    """Those of the setting with patches, in their order."""
+    """Methods of the setting with patches, in order."""
     return summary.loc[summary["corruption"] == "patch", "method"].tolist()
 
 
@@ -53,24 +53,24 @@ def patch_gate(folder: Path) -> dict[str, Any]:
     return gate(folder, "patch")
 
 
-def test_a_setting_discriminates_if_state_acro_and_the_best_method_hold(tmp_path):
+def test_setting_discriminates_if_all_gates_pass(tmp_path):
     row = patch_gate(grid(tmp_path, GOOD))
     assert row["verdict"] == "discriminates"
     assert row["data_return"] == DATA
     assert row["state_share"] == pytest.approx(760 / DATA)
     assert row["acro_share"] == pytest.approx(670 / DATA)
-    assert row["best_share"] == pytest.approx(520 / DATA), "the best that learned, not the ceiling"
+    assert row["best_share"] == pytest.approx(520 / DATA), "best method, excluding the supervised ceiling"
     assert row["above_random"] == pytest.approx(520 - 120)
     assert (row["low"], row["high"]) == pytest.approx(ABOVE_RANDOM)
     assert (row["state_seeds"], row["acro_seeds"]) == (2, 2)
 
 
-def test_the_best_method_is_one_whose_seeds_tell_how_sure_it_is(tmp_path):
+def test_best_method_needs_two_seeds(tmp_path):
     row = patch_gate(grid(tmp_path, GOOD | {("mik", "patch"): (99,)}))
     assert (row["verdict"], row["above_random"]) == ("discriminates", pytest.approx(520 - 120))
 
 
-def test_references_are_methods_as_they_are_and_not_their_variants(tmp_path):
+def test_gate_references_exclude_variants(tmp_path):
     grid(tmp_path, GOOD | {("state", "patch"): ()})
     grid(tmp_path, {("state", "patch"): (75, 77)}, pose_noise=34)
     row = patch_gate(grid(tmp_path, {("random", "patch"): (49,)}, history="gru"))
@@ -78,10 +78,10 @@ def test_references_are_methods_as_they_are_and_not_their_variants(tmp_path):
     assert (row["above_random"], row["low"]) == pytest.approx((520 - 120, ABOVE_RANDOM[0]))
 
 
-def test_the_best_method_is_held_against_random_that_was_fine_tuned_alike(tmp_path):
+def test_best_method_is_compared_with_random_of_equal_finetuning(tmp_path):
     grid(tmp_path, GOOD | {("random", "patch"): ()})
     grid(tmp_path, {("random", "patch"): (10, 14)}, steps=0)
-    assert patch_gate(tmp_path)["verdict"] == "discriminates", "it is not pretrained"
+    assert patch_gate(tmp_path)["verdict"] == "discriminates", "random is not pretrained, so steps do not matter"
     for run in tmp_path.glob("random-*"):
         describe(run, updates=500)
     row = patch_gate(tmp_path)
@@ -89,10 +89,10 @@ def test_the_best_method_is_held_against_random_that_was_fine_tuned_alike(tmp_pa
     assert (row["above_random"], row["low"]) == (None, None)
     for run in tmp_path.glob("acro-patch-*"):
         describe(run, updates=500)
-    assert patch_gate(tmp_path)["above_random"] == pytest.approx(210 - 120), "the best of those that are alike"
+    assert patch_gate(tmp_path)["above_random"] == pytest.approx(210 - 120), "best method with equal updates"
 
 
-def test_a_single_seed_of_a_reference_counts_where_there_are_no_more(tmp_path):
+def test_single_reference_seed_counts_if_alone(tmp_path):
     lone = GOOD | {("acro", "none"): (60,)}
     assert patch_gate(grid(tmp_path / "lone", lone))["acro_share"] == pytest.approx(600 / DATA)
     grid(tmp_path / "lucky", GOOD | {("acro", "none"): (55, 56)})
@@ -100,13 +100,13 @@ def test_a_single_seed_of_a_reference_counts_where_there_are_no_more(tmp_path):
     assert row["acro_share"] == pytest.approx(555 / DATA)
 
 
-def test_the_state_counts_once_a_seed_and_that_of_the_setting_first(tmp_path):
+def test_state_reference_counts_each_seed_once(tmp_path):
     grid(tmp_path, GOOD | {("state", "none"): (9, 11, 40)})
     assert gate(tmp_path, "none")["state_share"] == pytest.approx(200 / DATA)
     assert patch_gate(tmp_path)["state_share"] == pytest.approx((750 + 770 + 400) / 3 / DATA)
 
 
-def test_a_reference_is_held_against_its_own_data(tmp_path):
+def test_references_are_divided_by_their_own_data_return(tmp_path):
     grid(tmp_path, GOOD | {("state", "patch"): ()})
     row = patch_gate(write_seeds(tmp_path, {("state", "patch"): (75, 77)}, 400.0))
     assert (row["state_share"], row["acro_share"]) == (pytest.approx(760 / 400), pytest.approx(670 / DATA))
@@ -114,7 +114,7 @@ def test_a_reference_is_held_against_its_own_data(tmp_path):
 
 
 @pytest.mark.parametrize(("data", "words"), [(None, "not known"), (-1000.0, "not above 0"), (0.0, "not above 0")])
-def test_data_of_whose_return_there_are_no_shares_are_said(tmp_path, data, words):
+def test_gates_need_a_positive_data_return(tmp_path, data, words):
     row = patch_gate(write_seeds(tmp_path, GOOD, data))
     assert row["data_return"] == data
     assert (row["state_share"], row["acro_share"], row["best_share"]) == (None, None, None)
@@ -138,7 +138,7 @@ def test_data_of_whose_return_there_are_no_shares_are_said(tmp_path, data, words
         ({("random", "patch"): (10,), ("acro", "none"): (1, 1)}, f"{UNDECIDED}: acro under none returns 0.01"),
     ],
 )
-def test_a_missed_gate_is_named_and_what_was_not_measured_too(tmp_path, changes, verdict):
+def test_verdict_names_failed_and_unmeasured_gates(tmp_path, changes, verdict):
     found = patch_gate(grid(tmp_path, GOOD | changes))["verdict"]
     assert found.startswith(verdict)
 
@@ -155,8 +155,8 @@ def test_a_missed_gate_is_named_and_what_was_not_measured_too(tmp_path, changes,
         ("walker_walk", "expert_noisy", 664.0, 0.7, "none published"),
     ],
 )
-def test_what_pixels_must_return_is_what_published_methods_do(tmp_path, task, quality, data, share, source):
-    """Of a set's own return: cheetah's expert 0.62 (published 0.78), humanoid's 0.06 to 0.26."""
+def test_pixel_gate_follows_published_returns(tmp_path, task, quality, data, share, source):
+    """As shares of the data's return."""
     of_set = {"task": task, "quality": quality}
     for name, factor in (("just", 1.001), ("not", 0.999)):
         write_seeds(tmp_path / name, {("acro", "none"): (share * data * factor / 10,)}, data, of_set=of_set)
@@ -165,8 +165,8 @@ def test_what_pixels_must_return_is_what_published_methods_do(tmp_path, task, qu
         assert row["verdict"].startswith("not known" if name == "just" else "undecided at this budget: acro under none")
 
 
-def test_a_bar_is_of_each_runs_own_data(tmp_path):
-    """Training seeds may have sets of their own; one that returns less than was published asks 0.8."""
+def test_gate_threshold_averages_over_the_data_of_runs(tmp_path):
+    """A set that returns less than the published score has the threshold 0.8."""
     write_seeds(tmp_path, {("acro", "none"): (70, 70)}, 1000.0)
     Reference(600.0).write(tmp_path / "acro-none-1-td3_bc")
     row = gate(tmp_path, "none")
@@ -179,7 +179,7 @@ MOVED |= {("state", "patch"): "state"}
 
 @pytest.mark.parametrize("who", MOVED)
 @pytest.mark.parametrize("moved", [0.021, -0.021])
-def test_a_critic_that_still_moves_leaves_the_setting_undecided(tmp_path, who, moved):
+def test_unconverged_critic_leaves_setting_undecided(tmp_path, who, moved):
     grid(tmp_path, GOOD)
     move(tmp_path, *who, moved)
     row = patch_gate(tmp_path)
@@ -189,14 +189,14 @@ def test_a_critic_that_still_moves_leaves_the_setting_undecided(tmp_path, who, m
     assert patch_gate(tmp_path)["verdict"] == "discriminates"
 
 
-def test_a_critic_that_no_verdict_rests_on_does_not_count(tmp_path):
+def test_unused_critics_do_not_affect_verdict(tmp_path):
     grid(tmp_path, GOOD)
     move(tmp_path, "acro", "patch", 0.5)
     row = patch_gate(tmp_path)
     assert (row["verdict"], row["converged"]) == ("discriminates", True)
 
 
-def test_runs_that_do_not_record_it_are_not_known_to_have_converged(tmp_path):
+def test_unrecorded_convergence_is_unknown(tmp_path):
     row = patch_gate(grid(tmp_path / "early", GOOD, moved=None))
     assert row["verdict"] == "not known to discriminate: convergence is not recorded"
     assert row["converged"] is None
@@ -208,14 +208,14 @@ def test_runs_that_do_not_record_it_are_not_known_to_have_converged(tmp_path):
 
 
 @pytest.mark.parametrize(("algorithm", "record"), [("bc", None), ("mine", {})])
-def test_an_algorithm_without_a_critic_is_not_asked(tmp_path, algorithm, record):
+def test_algorithms_without_critic_need_no_convergence(tmp_path, algorithm, record):
     grid(tmp_path, GOOD, algorithm=algorithm, moved=None)
     for run in tmp_path.iterdir() if record is not None else ():
         write_json(run / "critic.json", record)
     assert patch_gate(tmp_path)["verdict"] == "discriminates"
 
 
-def test_methods_of_an_undecided_setting_are_listed_by_name(tmp_path):
+def test_undecided_settings_are_not_ranked(tmp_path):
     runs = grid(tmp_path / "runs", GOOD | {("state", "patch"): (9, 9)})
     report = write_report([runs], tmp_path / "out")
     assert ("walker_walk", "expert", "patch", "td3_bc") in unranked(report.gates)
@@ -228,21 +228,21 @@ def test_methods_of_an_undecided_setting_are_listed_by_name(tmp_path):
     assert methods(ranked.summary)[0] == "mik+a"
 
 
-def test_a_gate_that_one_algorithm_misses_says_nothing_of_another(tmp_path, capsys):
+def test_gates_are_separate_per_algorithm(tmp_path, capsys):
     grid(tmp_path / "runs", GOOD)
     grid(tmp_path / "runs", GOOD | {("acro", "none"): (9, 9)}, algorithm="iql")
     report = write_report([tmp_path / "runs"], tmp_path / "out")
     assert {place[3] for place in unranked(report.gates)} == {"iql"}
     verdicts = {(row["algorithm"], row["verdict"]) for row in report.claims if row["verdict"]}
     assert verdicts == {("iql", "not judged: undecided at this budget"), ("td3_bc", "holds")}
-    assert methods(report.summary)[0] == "mik+a", "one can rank"
+    assert methods(report.summary)[0] == "mik+a", "one algorithm can be ranked"
     print_summary(report)
     for shown in (re.sub(r"</td>\s*<td>", ": ", report.page.read_text()), " ".join(capsys.readouterr().out.split())):
         assert "walker_walk expert, patch, iql: undecided at this budget: acro under none" in shown
         assert "walker_walk expert, patch: discriminates" in shown
 
 
-def test_methods_are_listed_by_name_where_every_algorithm_misses_a_gate(tmp_path):
+def test_settings_undecided_for_all_algorithms_are_not_ranked(tmp_path):
     for algorithm in ("td3_bc", "iql"):
         grid(tmp_path / "runs", GOOD | {("acro", "none"): (9, 9)}, algorithm=algorithm)
     summary = write_report([tmp_path / "runs"], tmp_path / "out").summary

@@ -1,4 +1,4 @@
-"""Runs as a report loads them: what pools under one label, what is missing, and what is damaged."""
+"""Loading runs for a report: pooling, gaps and damaged files."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from vd4rl_pomdp.report.page import unlike, write_report
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 
-def test_bad_input_is_one_line(tmp_path):
+def test_invalid_runs_are_rejected(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
         write_report([tmp_path / "nowhere"], tmp_path / "out")
     (tmp_path / "empty").mkdir()
@@ -26,7 +26,7 @@ def test_bad_input_is_one_line(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_damaged_film_is_named(tmp_path):
+def test_damaged_film_is_rejected(tmp_path):
     write_run(tmp_path / "a", "acro", 0, {10: [1.0]})
     film = tmp_path / "a" / "film.npz"
     np.savez_compressed(film, clean=np.arange(999))
@@ -37,7 +37,7 @@ def test_a_damaged_film_is_named(tmp_path):
             write_report([tmp_path / "a"], tmp_path / "out")
 
 
-def test_labels_and_cards_that_are_not_whole_are_named(tmp_path):
+def test_incomplete_labels_and_cards_are_rejected(tmp_path):
     run = describe(write_run(tmp_path / "runs/a", "acro", 0, {10: [2.0]}), {})
     (tmp_path / "runs" / "b").mkdir()
     for name in ("config.json", "metrics.jsonl"):
@@ -51,7 +51,7 @@ def test_labels_and_cards_that_are_not_whole_are_named(tmp_path):
             write_report([run], tmp_path / "out")
 
 
-def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
+def test_runs_pool_over_seed_folder_device_and_logging(tmp_path):
     for seed in (0, 1):
         run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})
         noise = {"out": str(run), "encoder": str(seed), "device": str(seed), "log_every": seed, "workers": seed}
@@ -61,7 +61,7 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
 
 A, B = "a" * 24, "b" * 24
 DIFFERENT = {
-    # encoder's and policy's settings of two sets of runs, and their variants
+    # encoder and policy settings of two groups of runs, and their variants
     "steps": ({"steps": 20}, {}, {"steps": 60}, {}, ["steps 20", "steps 60"]),
     "updates": ({}, {"updates": 5}, {}, {"updates": 9}, ["updates 5", "updates 9"]),
     "same name": ({"batch_size": 8}, {}, {"batch_size": 16}, {}, [f"pretraining batch_size {n}" for n in (8, 16)]),
@@ -92,7 +92,7 @@ DIFFERENT = {
 
 
 @pytest.mark.parametrize(("card", "config", "other_card", "other", "words"), DIFFERENT.values(), ids=DIFFERENT)
-def test_runs_that_differ_are_rows_of_their_own(tmp_path, card, config, other_card, other, words):
+def test_runs_with_different_settings_are_separate_rows(tmp_path, card, config, other_card, other, words):
     for seed in (0, 1):
         for folder, before, own in (("one", card, config), ("other", other_card, other)):
             describe(write_run(tmp_path / f"runs/{folder}{seed}", "acro", seed, {10: [1.0]}), before, **own)
@@ -109,14 +109,14 @@ def test_runs_of_two_formats_do_not_pool(tmp_path):
 
 
 def corruptions_of(runs):
-    """By method, the corruptions that a report tells apart."""
+    """Corruption labels by method."""
     found = {}
     for run in load_runs([runs]):
         found.setdefault(run.method, set()).add(run.labels["corruption"])
     return found
 
 
-def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tmp_path):
+def test_corruption_options_define_settings(tmp_path):
     for method, size in (("acro", 16), ("mik+a", 48), ("mik", 48)):
         for seed in (0, 1):
             run = write_run(tmp_path / f"{method}{seed}", method, seed, {10: [1.0 + seed + size]})
@@ -126,7 +126,7 @@ def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tm
     assert corruptions_of(tmp_path) == {"acro": {few}, "mik+a": {many}, "mik": {many}, "random": {"patch"}}
 
 
-def test_an_option_is_not_a_corruptions_because_it_is_called_like_one_of_it(tmp_path):
+def test_policy_options_with_corruption_option_names_are_variants(tmp_path):
     for gamma, discount in ((1, 0.9), (1, 0.99), (2, 0.99)):
         options = {"gamma": gamma}
         run = describe(write_run(tmp_path / f"acro{gamma}{discount}", "acro", 0, {10: [1.0]}), options, gamma=discount)
@@ -140,7 +140,7 @@ def test_an_option_is_not_a_corruptions_because_it_is_called_like_one_of_it(tmp_
     }
 
 
-def test_where_nothing_is_hidden_no_option_counts(tmp_path):
+def test_corruption_options_are_ignored_without_corruption(tmp_path):
     for size in (16, 48):
         run = write_run(tmp_path / f"acro{size}", "acro", size, {10: [1.0]}, labels={"corruption": "none"})
         describe(run, {"patch_size": size})
@@ -148,7 +148,7 @@ def test_where_nothing_is_hidden_no_option_counts(tmp_path):
 
 
 def by_set(tmp_path, budgets):
-    """Runs of two methods on several sets, with budgets by method and set."""
+    """Write runs with `updates` by (method, "task quality")."""
     for (method, name), updates in budgets.items():
         labels = dict(zip(("task", "quality"), name.split(), strict=True))
         run = write_run(tmp_path / f"runs/{method}-{name}", method, 0, {10: [1.0]}, labels=labels)
@@ -156,19 +156,19 @@ def by_set(tmp_path, budgets):
     return tmp_path / "runs"
 
 
-def test_a_budget_of_each_set_makes_no_variants(tmp_path):
+def test_budgets_per_set_make_no_variants(tmp_path):
     sets = {"walker_walk expert": 20, "cheetah_run expert": 60, "cheetah_run medium": 20}
     runs = by_set(tmp_path, {(method, name): sets[name] for method in ("acro", "mik+a") for name in sets})
     assert pooled(runs) == {"acro": 3, "mik+a": 3}
 
 
-def test_a_budget_of_one_method_alone_is_no_sets_own(tmp_path):
+def test_budgets_of_one_method_make_variants(tmp_path):
     expert, medium = "walker_walk expert", "walker_walk medium"
     runs = by_set(tmp_path, {("acro", expert): 20, ("acro", medium): 60, ("mik+a", medium): 20})
     assert pooled(runs) == {"acro, updates 20": 1, "acro, updates 60": 1, "mik+a": 1}
 
 
-def test_a_preset_stands_for_what_it_decides(tmp_path):
+def test_preset_label_replaces_its_settings(tmp_path):
     for preset, k in (("cpu", 15), ("cpu", 1), ("smoke", 3)):
         run = write_run(tmp_path / f"runs/{preset}{k}", "acro", 0, {10: [1.0]})
         describe(run, {"max_k": k, "preset": preset, "steps": len(preset)}, preset=preset)
@@ -177,14 +177,14 @@ def test_a_preset_stands_for_what_it_decides(tmp_path):
 
 
 def on_set(folder, method, seed, content, collected, updates=10, **collection):
-    """A run on a set of some content, whose collection had a seed of its own."""
+    """Write a run on a dataset with fingerprint `content`, collected with seed `collected`."""
     run = write_run(folder / f"{method}-{seed}-{content}-{updates}", method, seed, {10: [1.0]})
     describe(run, {"data": content}, data=content, seed=seed, updates=updates)
-    told = {"task": "walker_walk", "episodes": 100, "seed": collected} | collection
-    write_json(run / "config.json", read_json(run / "config.json") | {"collection": told})
+    collection = {"task": "walker_walk", "episodes": 100, "seed": collected} | collection
+    write_json(run / "config.json", read_json(run / "config.json") | {"collection": collection})
 
 
-def test_a_set_a_seed_makes_seeds_of_one_method(tmp_path):
+def test_one_set_per_seed_pools_seeds(tmp_path):
     for method, seeds in (("acro", 3), ("mik+a", 2)):
         for seed in range(seeds):
             on_set(tmp_path / "runs", method, seed, f"{seed}" * 24, 100 + seed, rendered_by={"canary": "c", "gl": seed})
@@ -194,7 +194,7 @@ def test_a_set_a_seed_makes_seeds_of_one_method(tmp_path):
     for seed in range(3):
         on_set(tmp_path / "runs", "acro", seed, "a" * 24, 0, updates=20)
     one, own = "acro, updates 20, data aaaaaaaa", "acro, updates 10, data one a seed"
-    assert pooled(tmp_path / "runs") == {one: 3, own: 3, "mik+a": 2}, "beside one set for all seeds"
+    assert pooled(tmp_path / "runs") == {one: 3, own: 3, "mik+a": 2}, "next to one set for all seeds"
 
 
 @pytest.mark.parametrize(
@@ -206,9 +206,9 @@ def test_a_set_a_seed_makes_seeds_of_one_method(tmp_path):
         {"seed": 1, "content": "1" * 24, "collected": 101, "episodes": 200},
         {"seed": 1, "content": "1" * 24, "collected": 101, "rendered_by": {"canary": "another"}},
     ],
-    ids=["one content", "one collection", "one seed", "collected otherwise", "drawn otherwise"],
+    ids=["same content", "same collection seed", "same seed", "other collection", "other renderer"],
 )
-def test_other_contents_of_a_set_stay_variants(tmp_path, other):
+def test_other_dataset_contents_are_variants(tmp_path, other):
     on_set(tmp_path, "acro", 0, "0" * 24, 100)
     on_set(tmp_path, "acro", 2, "2" * 24, 102)
     on_set(tmp_path, "acro", **other)
@@ -217,19 +217,19 @@ def test_other_contents_of_a_set_stay_variants(tmp_path, other):
 
 
 def on_encoder(folder, seed, encoder, quality="expert"):
-    """A run of acro whose encoder was pretrained with a seed of its own."""
+    """Write a run of acro on an encoder pretrained with the seed `encoder`."""
     run = write_run(folder / f"{quality}-{encoder}-{seed}", "acro", seed, {10: [1.0]}, labels={"quality": quality})
     return describe(run, {}, encoder_seed=encoder)
 
 
-def test_seeds_on_one_encoder_are_no_replicates_of_the_method(tmp_path):
+def test_seeds_on_one_encoder_do_not_pool(tmp_path):
     for seed in (0, 1, 2):
         on_encoder(tmp_path / "one", seed, encoder=0)
         on_encoder(tmp_path / "own", seed, encoder=seed)
     assert pooled(tmp_path / "own") == {"acro": 3}
     assert pooled(tmp_path / "one") == {"acro": 1, "acro, pretraining seed 0": 2}
     gaps = [(row["variant"], row["seed"]) for row in find_gaps(load_runs([tmp_path / "one"]))]
-    assert gaps == [("", 1), ("", 2)], "seed 0 on the encoder of its own is no gap of those that share it"
+    assert gaps == [("", 1), ("", 2)], "runs that share the encoder of seed 0 do not lack seed 0"
     for seed, quality in enumerate(("expert", "medium")):
         for own in (2, 3):
             on_encoder(tmp_path / "runs", own, encoder=seed, quality=quality)
@@ -237,7 +237,7 @@ def test_seeds_on_one_encoder_are_no_replicates_of_the_method(tmp_path):
     assert pooled(tmp_path / "runs" / "expert-0-2") == {"acro, pretraining seed 0": 1}
 
 
-def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp_path):
+def test_gaps_include_ablations_but_not_budgets_per_task(tmp_path):
     runs = tmp_path / "runs"
     for k in (1, 15):
         describe(write_run(runs / f"expert{k}", "mik+a", 0, {10: [1.0]}), {"max_k": k})
@@ -259,7 +259,7 @@ def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp
     }
 
 
-def test_the_state_is_not_missing_where_other_pixels_of_the_same_set_are_hidden(tmp_path):
+def test_state_reference_is_missing_once_per_set(tmp_path):
     for method, quality, corruption in (
         *(("acro", quality, corruption) for quality in ("expert", "medium") for corruption in ("none", "patch")),
         ("state", "expert", "none"),

@@ -1,4 +1,4 @@
-"""What a report's page, its files and the terminal say."""
+"""A report's page, files and terminal output."""
 
 import csv
 import hashlib
@@ -48,10 +48,10 @@ def test_a_report_counts_seeds_not_episodes(tmp_path, drawn):
     write_run(tmp_path / "runs/random/0", "random", 0, {10: [95.0]})
     page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     acro, random = summary.to_dict("records")
-    assert (acro["method"], random["method"]) == ("acro", "random"), "references come last, whatever their score"
+    assert (acro["method"], random["method"]) == ("acro", "random"), "references come last"
     assert acro["score"] == pytest.approx(30.0)
     assert (acro["seeds"], acro["episodes"], acro["best_step"]) == (2, 4, 5)
-    assert acro["low"] < 20 < 40 < acro["high"], "two seeds, at 20 and 40, tell little"
+    assert acro["low"] < 20 < 40 < acro["high"], "two seeds, at 20 and 40"
     assert pd.isna(random["low"])
     assert len(table(tmp_path / "out" / "episodes.csv")) == 9
     text = page.read_text()
@@ -59,7 +59,7 @@ def test_a_report_counts_seeds_not_episodes(tmp_path, drawn):
     assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
 
 
-def test_last_and_best_evaluation_stand_apart(tmp_path):
+def test_last_and_best_evaluation_have_separate_columns(tmp_path):
     for seed in range(2):
         write_run(tmp_path / f"runs/{seed}", "acro", seed, {5: [90.0 + seed], 10: [20.0 + seed]})
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
@@ -67,14 +67,14 @@ def test_last_and_best_evaluation_stand_apart(tmp_path):
     assert row == ["acro", "20.5 [14.1, 26.9]", "10", "90.5 [84.1, 96.9]", "5", "2†", "2"]
 
 
-def test_the_report_of_mazes_is_named_where_there_are_only_mazes(tmp_path):
+def test_navigation_results_name_the_navigation_report(tmp_path):
     with pytest.raises(UserError, match="no evaluated run; `vd4rl-pomdp navigation report` reports its mazes"):
         write_report([ROOT / "results" / "navigation" / "longer"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_pretraining_alone_is_reported(tmp_path, drawn):
-    """As with a dataset of a task that no policy can be evaluated on."""
+def test_report_of_pretraining_runs_only(tmp_path, drawn):
+    """As for a dataset whose task cannot be evaluated."""
     pretraining(tmp_path / "runs")
     text = write_report([tmp_path / "runs"], tmp_path / "out").page.read_text()
     assert "Action loss of pretraining" in text
@@ -82,7 +82,7 @@ def test_pretraining_alone_is_reported(tmp_path, drawn):
     assert "<h2>Final scores</h2>" not in text
 
 
-def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
+def test_end_to_end_references_share_the_table(tmp_path):
     write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
     end_to_end = write_run(tmp_path / "runs/bc", "bc", 0, {10: [20.0]}, labels={"algorithm": "bc"})
     write_json(end_to_end / "probe.json", {"probe_pose": 12.5, "probe_velocity": 34.5})
@@ -94,21 +94,21 @@ def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
     assert (bc["probe_pose"], bc["probe_velocity"]) == ("12.5", "34.5")
     assert (bc["pretrain_seconds"], bc["finetune_seconds"]) == ("7.0", "3.0")
     chances = [(row["method"], row["probability"], row["wins"]) for row in table(tmp_path / "out" / "improvement.csv")]
-    assert chances == [("acro", "", "1.0"), ("bc", "", "0.0")], "one pair of runs tells no probability"
+    assert chances == [("acro", "", "1.0"), ("bc", "", "0.0")], "one pair of runs gives no probability"
     assert cells(page, "Probability of improvement</h2>") == [["acro", "", "1 of 1"], ["bc", "0 of 1", ""]]
     heads = re.findall(r"<th>(.*?)</th>", page.read_text().partition("Probability of improvement</h2>")[2])
     assert heads[:3] == ["row beats column", "acro", "bc"]
 
 
 @pytest.mark.parametrize(("method", "noted"), [("supervised+a", True), ("acro", False)])
-def test_a_probe_of_what_was_told_the_states_is_not_read_as_the_others(tmp_path, method, noted):
-    """Its episodes are held out from the probe alone."""
+def test_probes_of_supervised_methods_are_marked(tmp_path, method, noted):
+    """Their encoders have seen the states of the probe's held-out episodes."""
     page, *_ = write_report([write_run(tmp_path / "runs/0", method, 0, {10: [30.0]})], tmp_path / "out")
     part = page.read_text().partition("<h2>Representations</h2>")[2].partition("<h2>")[0]
     assert (f"{method}: trained on the states of all episodes" in part) == noted
 
 
-def test_an_ablation_is_two_rows_everywhere(tmp_path):
+def test_ablations_are_separate_rows(tmp_path):
     for k in (1, 15):
         describe(write_run(tmp_path / f"runs/{k}", "mik+a", 0, {5: [k], 10: [k]}, film=True), {"max_k": k})
     page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
@@ -121,7 +121,7 @@ def test_an_ablation_is_two_rows_everywhere(tmp_path):
         assert {row["variant"] for row in table(tmp_path / "out" / f"{name}.csv")} == {"max_k 1", "max_k 15"}
 
 
-def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
+def test_missing_cells_and_seeds_are_shown(tmp_path):
     page, summary, *_ = write_report([grid(tmp_path)], tmp_path / "out")
     found = summary.set_index(["quality", "method"])[["score", "missing"]].fillna(-1.0).T.to_dict("list")
     assert found == {
@@ -140,7 +140,7 @@ def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
     assert (len(states), gone) == (8, {("expert", "mik+a", "2"), ("medium", "mik+a", "0")})
 
 
-def test_unfinished_and_diverged_runs_are_named_and_kept_out_of_final_scores(tmp_path):
+def test_unfinished_and_diverged_runs_are_listed_without_final_scores(tmp_path):
     runs = grid(tmp_path)
     cut = runs / "acro2"
     (cut / "timing.json").unlink()
@@ -150,8 +150,8 @@ def test_unfinished_and_diverged_runs_are_named_and_kept_out_of_final_scores(tmp
     write_json(runs / "mik+a1" / "diverged.json", {"step": 7, "message": "critic_loss is nan <b>"})
     page, summary, *_ = write_report([runs], tmp_path / "out")
     found = summary.set_index(["quality", "method"])
-    told = [found.loc[("expert", name), ["score", "seeds", "missing"]].tolist() for name in ("acro", "mik+a")]
-    assert told == [
+    shown = [found.loc[("expert", name), ["score", "seeds", "missing"]].tolist() for name in ("acro", "mik+a")]
+    assert shown == [
         [20.5, 2, "seed 2 unfinished at 7 of 10 updates"],
         [20.0, 1, "seed 1 diverged at update 7 of 10; seed 2 missing"],
     ]
@@ -160,19 +160,19 @@ def test_unfinished_and_diverged_runs_are_named_and_kept_out_of_final_scores(tmp
     assert f"<td>{cut}</td>" in text
     assert "<td>diverged at update 7 of 10: critic_loss is nan &lt;b&gt;</td>" in text
     curves = {(r["quality"], r["method"], r["step"]): r["seeds"] for r in table(tmp_path / "out" / "curves.csv")}
-    assert (curves["expert", "acro", "5"], curves["expert", "acro", "10"]) == ("3", "2"), "curves show what there is"
+    assert (curves["expert", "acro", "5"], curves["expert", "acro", "10"]) == ("3", "2"), "curves use partial runs"
     write_report([tmp_path / "out"], tmp_path / "again")
     assert (tmp_path / "again" / "summary.csv").read_text() == (tmp_path / "out" / "summary.csv").read_text()
 
 
-def test_a_report_of_unfinished_runs_alone_says_so(tmp_path, drawn):
+def test_report_of_unfinished_runs_only(tmp_path, drawn):
     (describe(write_run(tmp_path / "runs/a", "acro", 0, {5: [1.0]}), {}) / "timing.json").unlink()
     page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     assert summary["missing"].tolist() == ["seed 0 unfinished at 10 of 10 updates"]
     assert "0 finished runs, 1 unfinished" in page.read_text()
 
 
-def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
+def test_report_overwrites_only_earlier_reports(tmp_path, capsys):
     for seed in (0, 1):
         write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [25.0]})
     write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
@@ -197,7 +197,7 @@ def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
     assert set(before.items()) <= set(files().items())
 
 
-def test_a_report_is_made_again_from_its_own_folder(tmp_path):
+def test_report_is_reproducible_from_its_own_folder(tmp_path):
     runs = grid(tmp_path)
     (runs / "acro1" / "timing.json").unlink()
     pretraining(runs / "pretrain")
@@ -209,13 +209,13 @@ def test_a_report_is_made_again_from_its_own_folder(tmp_path):
         assert text.replace(str(runs / "acro1"), "HERE") == other.replace(str(tmp_path / "one"), "HERE"), file.name
     rows = (tmp_path / "two" / "runs.jsonl").read_bytes()
     write_report([tmp_path / "two"], tmp_path / "two")
-    assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows, "beside the rows"
+    assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows, "a report in place keeps its rows"
 
 
 HOSTILE = '$\\frac$ <b>=1+1</b>, "x"|`y`\n[/red]_\u2028μ'
 
 
-def test_a_methods_name_is_text_and_nothing_else(tmp_path, capsys, drawn):
+def test_method_names_are_escaped(tmp_path, capsys, drawn):
     write_run(tmp_path / "runs/a", HOSTILE, 0, {5: [1.0], 10: [2.0]}, film=True, labels={"quality": "_$x_$"})
     main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
     assert "<b>=1+1" in capsys.readouterr().out.replace("\n", "")
@@ -229,7 +229,7 @@ def test_a_methods_name_is_text_and_nothing_else(tmp_path, capsys, drawn):
     assert read_episodes(tmp_path / "runs" / "a" / "episodes.csv") == rows[:1]
 
 
-def test_latex_sets_any_text(tmp_path):
+def test_latex_escapes_text(tmp_path):
     texts = pd.DataFrame({"a b": ["{~^\\}", "seed_2"], "50%": ["–", "$x_1$ & #"]})
     write_latex(tmp_path / "a.tex", texts, 1, "95% of it.")
     found = (tmp_path / "a.tex").read_text()
@@ -243,7 +243,7 @@ def test_latex_sets_any_text(tmp_path):
         assert text in found
 
 
-def test_a_machine_that_does_not_speak_utf8_ends_no_command(tmp_path):
+def test_report_runs_with_ascii_locale(tmp_path):
     write_run(tmp_path / "runs/a", "μ", 0, {10: [2.0]})
     words = [sys.executable, "-m", "vd4rl_pomdp", "report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
     ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
@@ -254,7 +254,7 @@ def test_a_machine_that_does_not_speak_utf8_ends_no_command(tmp_path):
 
 
 class Page(HTMLParser):
-    """Links of a page, and the words of its pictures."""
+    """Links and alternative texts of a page."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -270,7 +270,7 @@ class Page(HTMLParser):
             self.words.append(values.get("aria-label") or values.get("alt") or "")
 
 
-def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
+def test_figures_have_files_alternative_text_and_n(tmp_path, figure_files):
     runs = grid(tmp_path)
     pretraining(runs / "pretrain")
     for seed in (0, 1):
@@ -298,20 +298,20 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
         file.touch()
     before = page.read_bytes()
     write_report([runs], tmp_path / "out")
-    assert page.read_bytes() == before, "figures are the same bytes every time"
+    assert page.read_bytes() == before, "figures are deterministic"
     left = {path.name for path in folder.iterdir()} - {file.name for file in mine}
-    assert left == found, "figures of an earlier report go, nobody else's"
+    assert left == found, "old figures are removed, the user's files stay"
     assert all(file.exists() for file in mine)
 
 
-def test_single_evaluations_make_no_learning_curve(tmp_path):
+def test_single_evaluations_have_no_learning_curve(tmp_path):
     curves = pd.DataFrame(
         [dict.fromkeys(CONDITION, "") | {"step": 10, "score": 1.0, "low": 1.0, "high": 1.0, "seeds": 2}]
     )
     assert figures.curve_plots(curves, {}) == []
 
 
-def test_figures_show_returns_below_zero_best_evaluations_and_gaps(tmp_path, monkeypatch, drawn):
+def test_figures_show_negative_returns_best_evaluations_and_gaps(tmp_path, monkeypatch, drawn):
     plots = {}
     monkeypatch.setattr(figures, "save_plot", lambda _, plot: plots.update({plot.name: plot}))
     for method, score in {"mik+a": -20.0, "acro": -60.0}.items():
@@ -342,7 +342,7 @@ def test_figures_show_returns_below_zero_best_evaluations_and_gaps(tmp_path, mon
     assert dots == {"mik+a": [[20.0, -190.0], [20.0, -200.0]], "acro": [[20.0, -590.0], [20.0, -600.0]]}
 
 
-def test_methods_look_the_same_whatever_else_a_report_tells_of():
+def test_methods_have_fixed_styles():
     assert set(figures.LOOKS) == set(pretrain.objectives.METHODS)
     few, many = figures.looks_of(["acro", "random"]), figures.looks_of(["acro", "acro, m 4", "mine", "random"])
     assert {name: many[name] for name in few} == few
@@ -351,7 +351,7 @@ def test_methods_look_the_same_whatever_else_a_report_tells_of():
     assert len(set(looks)) == len(looks) >= 12
 
 
-def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_path, monkeypatch):
+def test_films_are_read_once_and_limited_by_size(tmp_path, monkeypatch):
     for method in ("acro", "mik", "random"):
         for seed in (0, 1):
             write_run(tmp_path / f"runs/{method}{seed}", method, seed, {10: [1.0]}, film=True)
@@ -367,7 +367,7 @@ def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_pat
     assert "2 more films are left out" in page.read_text()
 
 
-def test_runs_of_a_condition_share_one_entry(tmp_path):
+def test_seeds_of_a_condition_share_one_entry(tmp_path):
     for seed in range(15):
         describe(write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]}), {}, seed=seed)
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
@@ -375,7 +375,7 @@ def test_runs_of_a_condition_share_one_entry(tmp_path):
     assert entries == ["finetune acro, walker_walk expert, patch, seeds 0, 1, 2, ..., 14"]
 
 
-def test_files_of_figures_have_plain_names_of_their_own():
+def test_figure_file_names_are_safe_and_unique():
     names = ("patch+zero_frames", "../up", "up", "a b/c", "a-b-c", "ζ", "")
     found = [figures.file_name("scores", name) for name in names]
     assert found[0] == "scores_patch+zero_frames"
@@ -383,27 +383,27 @@ def test_files_of_figures_have_plain_names_of_their_own():
     assert all(re.fullmatch(r"[A-Za-z0-9+._-]+", name) and ".." not in name for name in found)
 
 
-def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
+def test_differing_data_and_code_are_reported(tmp_path, capsys):
     before = {"sources": {"method mine": "mine.py 0", "frame_encoder own": "own.py 0"}}
     after = {
         "plugins": {"frame_encoder own": "theirs 1.0"},
         "sources": {"method mine": "x", "frame_encoder own": "own.py 1"},
     }
-    for seed, told in enumerate(({}, after)):
+    for seed, record in enumerate(({}, after)):
         run = describe(write_run(tmp_path / f"runs/{seed}", "mine", seed, {10: [1.0]}), {}, "one")
-        write_json(run / "config.json", read_json(run / "config.json") | told)
-        kept = {"origin": before} if seed else before  # as earlier versions kept it, and as it is kept now
+        write_json(run / "config.json", read_json(run / "config.json") | record)
+        kept = {"origin": before} if seed else before  # seed 0: the layout of earlier versions
         write_json(run / "encoder/config.json", read_json(run / "encoder/config.json") | kept)
     other = describe(write_run(tmp_path / "runs/other", "random", 0, {10: [1.0]}), data="two")
     words = ["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
     main(words)
-    told = [
+    warnings = [
         "the set of walker_walk expert has 2 contents: one (mine); two (random)",
         "frame_encoder own has 2 states of its code: own.py 0 (mine); own.py 0 then theirs 1.0, own.py 1 (mine)",
     ]
-    assert capsys.readouterr().err == "".join(f"warning: {sentence}\n" for sentence in told)
+    assert capsys.readouterr().err == "".join(f"warning: {sentence}\n" for sentence in warnings)
     page = (tmp_path / "out" / "index.html").read_text()
-    assert all(sentence in page for sentence in told)
+    assert all(sentence in page for sentence in warnings)
     shutil.rmtree(other)
     shutil.rmtree(tmp_path / "runs/1")
     main([*words[:3], str(tmp_path / "again")])
@@ -411,13 +411,13 @@ def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
     assert "Not made of the same" not in (tmp_path / "again" / "index.html").read_text()
 
 
-def test_no_label_is_broken_within_a_word_at_eighty_columns(tmp_path):
+def test_tables_fit_eighty_columns(tmp_path):
     runs = tmp_path / "runs"
     write_seeds(runs, {("mik+a", "patch"): (50.0, 60.0, 55.0), ("acro", "patch"): (10.0, 12.0, 11.0)}, 600)
     write_seeds(runs, {("mik+a", "none"): (70.0, 71.0, 72.0)}, 600, random_histories=0.5)
     shown = io.StringIO()
     print_summary(write_report([runs], tmp_path / "out"), Console(file=shown, width=80))
-    assert "seeds 0, 1, 2" in shown.getvalue(), "a column that takes room"
-    assert shown.getvalue().count("random_histories") == 2, "a line in each table"
+    assert "seeds 0, 1, 2" in shown.getvalue(), "the widest column"
+    assert shown.getvalue().count("random_histories") == 2, "once per table"
     borders = [line[-1] for line in shown.getvalue().splitlines() if line[:1] in tuple("┏┃┡│└")]
-    assert set(borders) == set("┓┃┩│┘"), "a table that is wider than the terminal loses its right border"
+    assert set(borders) == set("┓┃┩│┘"), "a table wider than the terminal loses its right border"

@@ -1,4 +1,4 @@
-"""Statistics on scores whose answers are known."""
+"""Statistics, compared with known answers, scipy and rliable."""
 
 import json
 from pathlib import Path
@@ -10,10 +10,10 @@ import scipy.stats
 from vd4rl_pomdp.report import stats
 
 RLIABLE = json.loads((Path(__file__).parent / "rliable.json").read_text())
-"""Scores, and what an independent implementation says of them: tools/reference_statistics.py."""
+"""Scores and rliable's statistics of them, written by tools/reference_statistics.py."""
 METHODS = {name: [np.array(task) for task in tasks] for name, tasks in RLIABLE["scores"].items()}
 AGREES = 0.002
-"""Largest difference from its bootstrap's intervals, of scores between 0 and 1."""
+"""Tolerance for bootstrap intervals of scores between 0 and 1."""
 
 
 mean = stats.aggregates([])["mean"]
@@ -23,7 +23,7 @@ def bootstrap(strata, statistic, *how):
     return stats.bootstrap_intervals(strata, {"": statistic}, *how)[""]
 
 
-def test_iqm_drops_the_outer_quarters():
+def test_iqm_is_the_mean_of_the_middle_half():
     assert stats.iqm(np.array([0.0, 1.0, 2.0, 100.0])) == pytest.approx(1.5)
     # five runs: the middle 2.5 are 0.75 of the 2nd, the 3rd, 0.75 of the 4th
     assert stats.iqm(np.array([10.0, 1.0, 2.0, 3.0, -50.0])) == pytest.approx((0.75 * 1 + 2 + 0.75 * 3) / 2.5)
@@ -41,7 +41,7 @@ def test_other_statistics_on_known_values():
 
 
 @pytest.mark.parametrize("count", [5, 10, 30])
-def test_the_bootstrap_covers_as_theory_predicts(count):
+def test_bootstrap_coverage_matches_theory(count):
     rng = np.random.default_rng(count)
     hits, trials = 0, 2000
     for _ in range(trials):
@@ -54,15 +54,15 @@ def test_the_bootstrap_covers_as_theory_predicts(count):
     assert expected < 0.95
 
 
-def test_the_bootstrap_keeps_tasks_apart():
+def test_bootstrap_is_stratified_by_task():
     rng = np.random.default_rng(0)
-    # tasks far apart, no spread within: drawing across tasks would give an interval, drawing within gives none
+    # tasks differ but have no spread within: only resampling across tasks would widen the interval
     low, high = bootstrap([np.full(4, 0.0), np.full(4, 100.0)], mean, rng, 500)
     assert low == high == 50.0
     assert bootstrap([np.array([1.0])], mean, rng) is None
 
 
-def test_the_bootstrap_of_a_mean_is_as_wide_as_its_standard_error():
+def test_bootstrap_interval_of_mean_matches_standard_error():
     scores = np.arange(100) % 2.0  # a standard deviation of a half
     low, high = bootstrap([scores], mean, np.random.default_rng(0))
     assert (low, high) == pytest.approx((0.5 - 1.96 * 0.05, 0.5 + 1.96 * 0.05), abs=0.006)
@@ -70,7 +70,7 @@ def test_the_bootstrap_of_a_mean_is_as_wide_as_its_standard_error():
 
 @pytest.mark.parametrize("name", list(METHODS))
 @pytest.mark.parametrize("statistic", ["iqm", "median", "mean", "optimality_gap"])
-def test_aggregates_are_those_of_an_independent_implementation(name, statistic):
+def test_aggregates_match_rliable(name, statistic):
     strata = METHODS[name]
     chosen = stats.aggregates(strata)
     chosen["optimality_gap"] = lambda scores: stats.optimality_gap(scores, 1.0)
@@ -81,18 +81,18 @@ def test_aggregates_are_those_of_an_independent_implementation(name, statistic):
 
 
 @pytest.mark.parametrize("name", list(METHODS))
-def test_profiles_are_those_of_an_independent_implementation(name):
-    told, thresholds = RLIABLE["statistics"][name], np.array(RLIABLE["thresholds"])
+def test_profiles_match_rliable(name):
+    reference, thresholds = RLIABLE["statistics"][name], np.array(RLIABLE["thresholds"])
     shares, (low, high) = stats.performance_profile(METHODS[name], thresholds, np.random.default_rng(0))
-    assert shares == pytest.approx(np.array(told["profile"]), abs=1e-9)
-    # shares are multiples of 1/32, and so are the ends of both bands: between two of them they may part
+    assert shares == pytest.approx(np.array(reference["profile"]), abs=1e-9)
+    # shares and band ends are multiples of 1/32, so bands may differ by one step
     step = 1 / sum(map(len, METHODS[name]))
-    for found, expected in ((low, told["low"]), (high, told["high"])):
+    for found, expected in ((low, reference["low"]), (high, reference["high"])):
         assert found == pytest.approx(np.array(expected), abs=step + 1e-9)
         assert np.mean(np.abs(found - expected) < AGREES) >= 0.8
 
 
-def test_improvement_is_that_of_independent_implementations():
+def test_improvement_matches_rliable_and_scipy():
     one, other = METHODS["one"], METHODS["other"]
     chance, low, high = RLIABLE["improvement"]
     found = stats.probability_of_improvement(one, other)
@@ -102,7 +102,7 @@ def test_improvement_is_that_of_independent_implementations():
     assert stats.improvement_interval(one, other, np.random.default_rng(0)) == pytest.approx((low, high), abs=0.005)
 
 
-def test_one_seed_gives_no_interval_and_a_seed_of_draws_gives_the_same_one():
+def test_single_seed_has_no_interval_and_draws_are_seeded():
     rng = np.random.default_rng
     one, many, thresholds = [np.array([1.0])], [np.arange(5.0)], np.array([1.0])
     assert stats.improvement_interval(one, many, rng(0)) is None
@@ -120,12 +120,12 @@ def test_one_seed_gives_no_interval_and_a_seed_of_draws_gives_the_same_one():
 
 
 def levels(rng, seed_spread, episode_spread, shared=0.0, seeds=3, episodes=20):
-    """(seeds, episodes) scores about 0: a seed, an episode that all seeds share, and what both do not explain."""
+    """(seeds, episodes) scores around 0: seed effect + shared episode effect + noise."""
     of_seeds, of_episodes = rng.normal(0, seed_spread, (seeds, 1)), np.broadcast_to(shared, (episodes,))
     return of_seeds + of_episodes + rng.normal(0, episode_spread, (seeds, episodes))
 
 
-def test_an_interval_of_means_of_single_episodes_is_students_and_welchs():
+def test_single_episode_intervals_match_student_and_welch():
     rng = np.random.default_rng(0)
     one, other = rng.normal(3, 1, 4), rng.normal(0, 5, 7)
     student = scipy.stats.ttest_1samp(one, 0).confidence_interval(0.95)
@@ -134,7 +134,7 @@ def test_an_interval_of_means_of_single_episodes_is_students_and_welchs():
     assert stats.difference_interval(one[:, None], other[:, None]) == pytest.approx(tuple(welch))
 
 
-def test_a_difference_has_welchs_p_value_and_the_smallest_that_would_be_found():
+def test_difference_has_welch_p_value_and_detectable_effect():
     rng = np.random.default_rng(0)
     one, other = rng.normal(3, 1, 5), rng.normal(0, 5, 7)
     found, welch = stats.difference(one[:, None], other[:, None]), scipy.stats.ttest_ind(one, other, equal_var=False)
@@ -145,7 +145,7 @@ def test_a_difference_has_welchs_p_value_and_the_smallest_that_would_be_found():
     assert stats.difference(one[:1, None], other[:, None]) is None
 
 
-def test_a_difference_adds_the_errors_of_seeds_and_of_paired_episodes():
+def test_difference_adds_seed_and_paired_episode_errors():
     rng = np.random.default_rng(3)
     one, other = levels(rng, 2, 1, rng.normal(0, 5, 20)) + 4, levels(rng, 1, 1)
     parts = [(one.mean(1), 3), (other.mean(1), 3), (one.mean(0) - other.mean(0), 20)]
@@ -158,18 +158,18 @@ def test_a_difference_adds_the_errors_of_seeds_and_of_paired_episodes():
     assert stats.difference_interval(one, other) == found.interval
 
 
-def test_holm_adjusts_a_family():
+def test_holm_adjustment():
     assert stats.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert stats.holm([0.6, 0.7]) == [1.0, 1.0]
     assert stats.holm([0.2]) == [0.2]
     assert stats.holm([]) == []
     rng, trials = np.random.default_rng(4), 2000
     wrong = sum(min(stats.holm(list(rng.uniform(size=4)))) < 0.05 for _ in range(trials))
-    assert wrong / trials == pytest.approx(1 - (1 - 0.05 / 4) ** 4, abs=0.015), "at most 5%, of independent ones"
+    assert wrong / trials == pytest.approx(1 - (1 - 0.05 / 4) ** 4, abs=0.015), "family-wise error of independent tests"
 
 
 @pytest.mark.parametrize("spreads", [(1.0, 0.0, 0.0), (1.0, 4.5, 1.0), (0.0, 1.0, 0.0), (1.0, 4.5, 9.0)])
-def test_two_levels_cover_what_they_say_wherever_the_spread_comes_from(spreads):
+def test_two_level_intervals_have_nominal_coverage(spreads):
     *own, shared = spreads
     rng, trials = np.random.default_rng(1), 1000
     held = np.zeros(2)
@@ -181,30 +181,30 @@ def test_two_levels_cover_what_they_say_wherever_the_spread_comes_from(spreads):
     assert (held / trials > 0.93).all(), held / trials
 
 
-def test_seeds_that_happen_to_agree_are_no_surer_than_their_episodes():
-    """Three seeds of one mean each: 0.5 by 20 episodes that either walk or fall."""
+def test_agreeing_seeds_keep_episode_uncertainty():
+    """Three seeds with mean 0.5 from 20 episodes that score 0 or 1."""
     scores = np.tile(np.arange(20) % 2.0, (3, 1))
     low, high = stats.mean_interval(scores)
     reach = scipy.stats.t.ppf(0.975, 19) * scores[0].std(ddof=1) / np.sqrt(20)
     assert (low, high) == pytest.approx((0.5 - reach, 0.5 + reach))
-    for score in (0.5, 33.3, 813.2702):  # the means of 20 times 33.3 and of three of these differ by rounding
+    for score in (0.5, 33.3, 813.2702):  # means of equal scores may differ by rounding
         equal = np.full((3, 20), score)
-        assert stats.mean_interval(equal) is None, "no spread at all tells of none"
+        assert stats.mean_interval(equal) is None, "without spread there is no interval"
         assert stats.difference(equal, np.full((3, 20), 22.7)) is None
         unequal = equal + np.array([[0], [0], [1e-4]])
-        assert stats.difference(unequal, np.full((3, 20), 22.7)).p < 0.05, "a row's last digit is a spread"
+        assert stats.difference(unequal, np.full((3, 20), 22.7)).p < 0.05, "a stored digit of spread counts"
 
 
-def test_starts_that_two_methods_share_are_no_part_of_their_difference():
+def test_shared_episode_effects_cancel_in_differences():
     rng = np.random.default_rng(2)
     starts = rng.normal(0, 9, 20)
     one, other = (levels(rng, 0.1, 0.1, starts) for _ in range(2))
     low, high = stats.difference_interval(one, other)
     assert high - low < 1
     low, high = stats.difference_interval(one, other[:, :19])
-    assert high - low > 4, "of other episodes nothing is known to be shared"
+    assert high - low > 4, "different episodes cannot be paired"
 
 
-def test_seeds_of_unequally_many_episodes_count_by_their_means():
+def test_unequal_episode_counts_use_seed_means():
     assert stats.by_episode([[1.0, 3.0], [5.0, 7.0]]).tolist() == [[1.0, 3.0], [5.0, 7.0]]
     assert stats.by_episode([[1.0, 3.0], [5.0]]).tolist() == [[2.0], [5.0]]

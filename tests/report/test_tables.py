@@ -1,4 +1,4 @@
-"""Tables of a handful of rows whose entries can be worked out by hand."""
+"""Report tables of a few rows, compared with values computed by hand."""
 
 import re
 from typing import Any
@@ -26,7 +26,7 @@ SCORES = {
 
 
 def rows() -> pd.DataFrame:
-    """Two evaluations of every run, of two episodes each: at step 5 all score 99, at step 10 as above."""
+    """Two evaluations of two episodes per run: all score 99 at step 5, and `SCORES` at step 10."""
     same = {"quality": "expert", "corruption": "patch", "algorithm": "td3_bc", "variant": ""}
     found = [
         {"method": method, "task": task, "seed": seed, "step": step, "scores": scores if step == 10 else (99.0,) * 2}
@@ -46,7 +46,7 @@ def of(table: pd.DataFrame, **names: Any) -> list[dict[str, Any]]:
     return [row for row in table.to_dict("records") if all(row[name] == value for name, value in names.items())]
 
 
-def test_a_summary_is_of_the_last_evaluation_and_names_the_best_beside_it():
+def test_summary_shows_last_and_best_evaluation():
     (row,) = of(tables.summary(rows(), NO_GAPS), method="acro", task="walker_walk")
     assert (row["step"], row["score"], row["seeds"], row["episodes"]) == (10, 30.0, 2, 4)
     assert (row["best_step"], row["best_score"], row["few_seeds"]) == (5, 99.0, True)
@@ -55,21 +55,21 @@ def test_a_summary_is_of_the_last_evaluation_and_names_the_best_beside_it():
     assert (row["low"], row["high"]) == pytest.approx((30 - reach, 30 + reach))
 
 
-def test_curves_show_mean_and_range_over_seeds_at_every_evaluation():
+def test_curves_show_mean_and_range_over_seeds():
     found = of(tables.curves(rows()), method="acro", task="walker_walk")
     shown = [(row["step"], row["score"], row["low"], row["high"], row["seeds"]) for row in found]
     assert shown == [(5, 99.0, 99.0, 99.0, 2), (10, 30.0, 20.0, 40.0, 2)]
 
 
-def test_aggregates_are_over_the_runs_of_all_tasks_at_their_end():
+def test_aggregates_use_final_scores_of_all_tasks():
     (row,) = of(tables.aggregate(rows(), NO_GAPS), method="acro")
-    assert row["iqm"] == pytest.approx((40 + 60) / 2), "the middle half of 20, 40, 60, 80"
+    assert row["iqm"] == pytest.approx((40 + 60) / 2), "middle half of 20, 40, 60, 80"
     assert row["optimality_gap"] == pytest.approx(50.0)
     assert (row["tasks"], row["seeds"]) == (2, 2)
 
 
-def test_what_lacks_tasks_stands_below_what_has_them_all():
-    """Its mean is of other tasks: easier ones, perhaps."""
+def test_methods_with_missing_tasks_rank_last():
+    """Their mean covers other, perhaps easier, tasks."""
     table = rows()
     lacking = table[(table["method"] != "mik") | (table["task"] != "cheetah_run")]
     lacking = lacking.assign(score=lacking["score"].mask(lacking["method"] == "mik", 95.0))
@@ -78,14 +78,14 @@ def test_what_lacks_tasks_stands_below_what_has_them_all():
     assert found[1]["iqm"] > found[0]["iqm"]
 
 
-def test_profiles_are_shares_of_runs_above_a_score():
+def test_profiles_are_shares_of_runs_above_threshold():
     found = of(tables.profiles(rows()), method="mik")
     shares = {row["threshold"]: row["share"] for row in found}
     assert [shares[at] for at in (0, 30, 60)] == [0.75, 0.25, 0.25], "runs end at 20, 30, 90 and 0"
     assert all(row["low"] <= row["share"] <= row["high"] for row in found)
 
 
-def test_improvement_compares_runs_of_one_task_and_averages_over_tasks():
+def test_improvement_is_averaged_over_tasks():
     (row,) = of(tables.improvement(rows()), method="acro", other="mik")
     walker = np.mean([0.5, 0.0, 1.0, 1.0])  # 20 and 40 against 20 and 30
     cheetah = np.mean([0.0, 1.0, 0.0, 1.0])  # 60 and 80 against 90 and 0
@@ -96,7 +96,7 @@ def test_improvement_compares_runs_of_one_task_and_averages_over_tasks():
 
 
 def evaluated_clean(run, returns, errors):
-    """Give a run's last evaluation, whose action errors become the first of two, one under none with the second."""
+    """Set the action error of a run's last evaluation to `errors[0]`, and add a clean one with `errors[1]`."""
     episodes = [row for row in read_episodes(run / "episodes.csv") if row["step"] == 10]
     (run / "episodes.csv").unlink()
     append_episodes(run / "episodes.csv", [row | {"action_error": errors[0]} for row in episodes])
@@ -105,11 +105,11 @@ def evaluated_clean(run, returns, errors):
 
 
 def control(folder):
-    """What the methods of a folder's runs do, by method."""
+    """Rows of the control table by method."""
     return tables.control(runs_frame(load_runs([folder]))).set_index("method").to_dict("index")
 
 
-def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
+def test_control_table_shows_corrupted_and_clean_returns(tmp_path):
     for seed, score in enumerate((30.0, 50.0)):
         run = write_run(tmp_path / str(seed), "acro", seed, {10: [score, 90.0]})
         Reference(500.0, None, 0.01 * (seed + 1)).write(run)
@@ -125,15 +125,15 @@ def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
     assert [name for name in (*numbers, *clean) if not np.isnan(found["mik"][name])] == ["return", "seeds"]
 
 
-def test_a_mean_that_a_seed_does_not_know_is_not_told(tmp_path):
-    """It would stand beside a number of seeds that are not behind it."""
+def test_means_over_incomplete_seeds_are_missing(tmp_path):
+    """Else the number of seeds beside the mean would be wrong."""
     runs = [write_run(tmp_path / str(seed), "acro", seed, {10: [30.0 + seed]}) for seed in (0, 1)]
     evaluated_clean(runs[0], [400.0], (0.1, 0.2))
     row = control(tmp_path)["acro"]
     assert (row["return"], np.isnan(row["clean_return"]), row["seeds"]) == (305.0, True, 2)
 
 
-def test_critics_stand_beside_the_value_of_the_datas_policy(tmp_path):
+def test_critics_table_shows_value_of_data_policy(tmp_path):
     write_seeds(tmp_path, {("acro", "patch"): (20, 22), ("mik", "patch"): (30,)}, 600.0)
     write_json(tmp_path / "acro-patch-1-td3_bc" / "critic.json", {"value": 170.0, "moved": -0.05, "data": 162.0})
     write_seeds(tmp_path, {("random", "patch"): (10,)}, 600.0, moved=None)
@@ -143,7 +143,7 @@ def test_critics_stand_beside_the_value_of_the_datas_policy(tmp_path):
     names = ("critic_value", "critic_moved", "data_value", "converged", "seeds")
     assert [round(found["acro"][name], 4) for name in names] == [160, 0.03, 161, 1, 2]
     assert [round(found["mik"][name], 4) for name in names] == [150, 0.01, 160, 1, 1]
-    assert np.isnan([found["random"][name] for name in names[:4]]).all(), "an early run"
+    assert np.isnan([found["random"][name] for name in names[:4]]).all(), "not recorded"
     assert "curl" not in found, "without a critic"
     own = frame.set_index(["method", "seed"])[["critic_value", "critic_moved", "data_value", "converged"]]
     assert own.loc["acro", 1].tolist() == [170.0, -0.05, 162.0, False]
@@ -155,13 +155,13 @@ def test_critics_stand_beside_the_value_of_the_datas_policy(tmp_path):
     assert ",critic_value,critic_moved,data_value,converged," in (tmp_path / "out" / "runs.csv").read_text()
 
 
-def test_what_was_trained_clean_counts_as_both(tmp_path):
+def test_clean_training_counts_as_clean_evaluation(tmp_path):
     write_run(tmp_path / "0", "acro", 0, {10: [30.0]}, labels={"corruption": "none"})
     row = control(tmp_path)["acro"]
     assert (row["return"], row["clean_return"]) == (300.0, 300.0)
 
 
-def test_returns_are_those_of_the_episodes_whatever_divides_the_tasks_scores(tmp_path):
+def test_returns_do_not_depend_on_score_scale(tmp_path):
     run = write_run(tmp_path / "0", "acro", 0, {5: [9.0], 10: [30.0, 90.0]})
     episodes = read_episodes(run / "episodes.csv")
     (run / "episodes.csv").unlink()
@@ -170,20 +170,20 @@ def test_returns_are_those_of_the_episodes_whatever_divides_the_tasks_scores(tmp
     assert (row["return"], control(tmp_path)["acro"]["return"]) == (60.0, 60.0)
 
 
-def told_losses(seed: int, every: int, loss: float, steps: int = 50_000):
-    """A pretraining that told of a loss at some steps."""
+def logged_losses(seed: int, every: int, loss: float, steps: int = 50_000):
+    """A pretraining run that logged its loss every `every` steps."""
     named = dict.fromkeys(CONDITION, "") | {"method": "acro", "seed": seed}
     return named, [(step, loss + 1 / step) for step in range(every, steps + 1, every)]
 
 
-def test_losses_are_means_at_steps_that_all_runs_told_of():
-    found = tables.losses([told_losses(0, 100, 1.0), told_losses(1, 150, 2.0, 49_800)])
+def test_losses_are_averaged_at_common_steps():
+    found = tables.losses([logged_losses(0, 100, 1.0), logged_losses(1, 150, 2.0, 49_800)])
     assert found["step"].tolist() == list(range(300, 49_801, 300))
     assert found["action_loss"].to_numpy() == pytest.approx(1.5 + 1 / found["step"].to_numpy())
     assert set(found["seeds"]) == {2}
 
 
-def test_a_long_loss_curve_is_thinned_and_keeps_its_ends():
-    steps = tables.losses([told_losses(0, 100, 1.0)])["step"].tolist()
+def test_long_loss_curves_are_thinned():
+    steps = tables.losses([logged_losses(0, 100, 1.0)])["step"].tolist()
     assert (steps[0], steps[-1], len(steps)) == (100, 50_000, 200)
     assert steps == sorted(set(steps))

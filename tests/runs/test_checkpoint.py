@@ -1,4 +1,4 @@
-"""Checkpoints: what goes in comes out, and whatever cuts a writing, the newest whole one is found."""
+"""Checkpoints restore what was saved; an interrupted write never loses the newest complete one."""
 
 import os
 import sys
@@ -19,7 +19,7 @@ def at(step: int) -> dict[str, Any]:
 
 
 def newest(kept: Checkpoints) -> dict[str, Any]:
-    """The state that a run would resume from."""
+    """The state from which a run would resume."""
     taken: list[dict[str, Any]] = []
     kept.restore(taken.append)
     (state,) = taken
@@ -40,7 +40,7 @@ def names(path: Path) -> list[str]:
     return sorted(p.name for p in (path / "checkpoints").iterdir())
 
 
-def test_nested_state_comes_back_as_it_was():
+def test_pack_and_unpack_nested_state():
     model = torch.nn.Linear(3, 2)
     optimiser = torch.optim.Adam(model.parameters())
     model(torch.ones(1, 3)).sum().backward()
@@ -51,12 +51,12 @@ def test_nested_state_comes_back_as_it_was():
     fresh.load_state_dict(loaded["optimiser"])
     assert torch.equal(fresh.state_dict()["state"][0]["exp_avg"], optimiser.state_dict()["state"][0]["exp_avg"])
     assert (loaded["step"], loaded["note"], loaded["none"]) == (3, "x", None)
-    assert len(pack({"row": torch.zeros(1000, 1000)[0]})) < 10_000, "a part does not bring the whole along"
+    assert len(pack({"row": torch.zeros(1000, 1000)[0]})) < 10_000, "a slice does not store its base"
     with pytest.raises(UserError, match="a checkpoint cannot store noise/0, which is a float64: use a tensor"):
         pack({"noise": [np.float64(1.0)]})
 
 
-def test_the_two_newest_are_kept(two, tmp_path):
+def test_two_newest_checkpoints_are_kept(two, tmp_path):
     assert two.restore(lambda state: None) == 1.0
     two.add(13, at(13), 2.0)
     assert names(tmp_path) == ["13.pt", "2.pt"]
@@ -67,7 +67,7 @@ def test_the_two_newest_are_kept(two, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "bit", "empty"])
-def test_a_damaged_newest_one_costs_a_line_and_the_steps_since_the_one_before(two, tmp_path, capsys, damage):
+def test_damaged_checkpoint_falls_back_to_previous_one(two, tmp_path, capsys, damage):
     path = tmp_path / "checkpoints" / "2.pt"
     content = path.read_bytes()
     place = content.index(at(2)["weights"].numpy().tobytes())
@@ -85,10 +85,10 @@ def test_a_damaged_newest_one_costs_a_line_and_the_steps_since_the_one_before(tw
     assert names(tmp_path) == ["1.pt", "2.pt"]
 
 
-def test_one_of_another_format_or_config_is_one_sentence(two, monkeypatch):
+def test_checkpoint_of_another_format_or_config_is_rejected(two, monkeypatch):
     with pytest.raises(UserError, match=r"2\.pt: this checkpoint does not fit the run \('updates'\)"):
         two.restore(lambda state: state["updates"])
-    with pytest.raises(torch.OutOfMemoryError):  # which does not make it another's
+    with pytest.raises(torch.OutOfMemoryError):  # not mistaken for a checkpoint that does not fit
         two.restore(lambda state: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
     monkeypatch.setattr(checkpoint, "FORMAT", 99)
     with pytest.raises(UserError, match=r"format \d+, this version writes format 99"):
@@ -96,7 +96,7 @@ def test_one_of_another_format_or_config_is_one_sentence(two, monkeypatch):
 
 
 def killed_at(number: int, action) -> bool:
-    """Run an action in a forked process that dies right before its `number`-th file system call; whether it did."""
+    """Run an action in a fork that dies before its `number`-th file system call; return whether it died."""
     child = os.fork()
     if child == 0:
         calls = []
@@ -116,7 +116,7 @@ def killed_at(number: int, action) -> bool:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_whatever_moment_a_kill_takes_the_newest_whole_checkpoint_is_found(tmp_path):
+def test_a_kill_at_any_system_call_keeps_a_complete_checkpoint(tmp_path):
     number, found = 0, set()
     while True:
         number += 1
@@ -126,7 +126,7 @@ def test_whatever_moment_a_kill_takes_the_newest_whole_checkpoint_is_found(tmp_p
             kept.add(step, at(step), 0.0)
         if not killed_at(number, lambda kept=kept: kept.add(3, at(3), 0.0)):
             break
-        for _ in range(2):  # a second kill, while the rest of the first one is still there
+        for _ in range(2):  # a second kill, while files of the first attempt remain
             killed_at(max(1, number - 2), lambda kept=kept: kept.add(3, at(3), 0.0))
         found.add(newest(kept)["step"])
         kept.add(3, at(3), 0.0)

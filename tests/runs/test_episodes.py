@@ -1,4 +1,4 @@
-"""The table of evaluation episodes: what is damaged is named, what is there stays."""
+"""The table of evaluation episodes: damage is named, and existing rows stay."""
 
 import os
 import threading
@@ -18,7 +18,7 @@ acro,walker_walk,expert,patch,td3_bc,0,2,0,20000,847.1,500,84.71,none,0.25
 )
 
 
-def test_rows_are_read_as_they_stand_and_appended_to_with_columns_of_ones_own(tmp_path):
+def test_episode_rows_round_trip_with_extra_columns(tmp_path):
     path = tmp_path / "episodes.csv"
     path.write_text(ROWS)
     rows = read_episodes(path)
@@ -34,7 +34,7 @@ def test_rows_are_read_as_they_stand_and_appended_to_with_columns_of_ones_own(tm
 
 
 @pytest.mark.parametrize("end", ["", ",", ",patch", ",patch,nan", ",patch,0.1.2", ",,0.1", ",patch,0.1,more"])
-def test_a_row_whose_end_is_missing_or_wrong_is_not_read(tmp_path, end):
+def test_incomplete_or_malformed_rows_are_rejected(tmp_path, end):
     path = tmp_path / "episodes.csv"
     header, line, _ = ROWS.splitlines()
     path.write_text(f"{header}\n{line.removesuffix(',patch,')}{end}\n")
@@ -42,7 +42,7 @@ def test_a_row_whose_end_is_missing_or_wrong_is_not_read(tmp_path, end):
         read_episodes(path)
 
 
-def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_path):
+def test_header_is_written_once(tmp_path):
     path = tmp_path / "episodes.csv"
     append_episodes(path, [])
     header = path.read_text()
@@ -53,7 +53,7 @@ def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_pat
         append_episodes(tmp_path / "nowhere" / "episodes.csv", [])
 
 
-def test_who_finds_another_appending_waits_and_writes_no_second_header(tmp_path):
+def test_concurrent_append_waits_for_the_lock(tmp_path):
     path, begun = tmp_path / "episodes.csv", threading.Event()
 
     def append() -> None:
@@ -72,7 +72,7 @@ def test_who_finds_another_appending_waits_and_writes_no_second_header(tmp_path)
 
 
 @pytest.mark.parametrize("cell", ["nan", "inf", "many", "9" * 200_000], ids=["nan", "inf", "word", "endless"])
-def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
+def test_damaged_episode_table_is_rejected_and_kept(tmp_path, cell):
     path = tmp_path / "episodes.csv"
     path.write_text(before := ROWS.replace("71.9199", cell))
     for read in (lambda: read_episodes(path), lambda: drop_episodes_after(path, 1)):
@@ -81,7 +81,7 @@ def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
     assert path.read_text() == before
 
 
-def test_a_row_that_a_kill_or_a_full_disk_cut_is_not_read_and_nothing_is_glued_to_it(tmp_path):
+def test_truncated_last_row_is_rejected_until_dropped(tmp_path):
     path = tmp_path / "episodes.csv"
     path.write_text(ROWS)
     row = read_episodes(path)[0]
@@ -94,7 +94,7 @@ def test_a_row_that_a_kill_or_a_full_disk_cut_is_not_read_and_nothing_is_glued_t
     assert read_episodes(path) == [row]
 
 
-def test_appended_lines_are_on_the_disk_when_the_block_ends(tmp_path, monkeypatch):
+def test_appended_lines_are_fsynced(tmp_path, monkeypatch):
     path, synchronised = tmp_path / "rows", []
     monkeypatch.setattr("os.fsync", lambda handle: synchronised.append((os.fstat(handle).st_ino, path.read_text())))
     with appending(path) as file:

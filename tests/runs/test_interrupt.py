@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a checkpoint where one can be made, one line, the right exit code, and no process left."""
+"""Ctrl-C and SIGTERM: a checkpoint where possible, one line, the right exit code, and no process left."""
 
 import os
 import signal
@@ -30,10 +30,10 @@ if __name__ == "__main__":
 """
 SLOW_JOBS = """
 import sys
-from tests.runs.test_workers import tell_and_sleep
+from tests.runs.test_workers import print_pid_and_sleep
 from vd4rl_pomdp.cli import main, stages
 from vd4rl_pomdp.runs.workers import run_jobs
-stages.list_parts = lambda words, program: list(run_jobs(tell_and_sleep, [0, 1], 2))
+stages.list_parts = lambda words, program: list(run_jobs(print_pid_and_sleep, [0, 1], 2))
 if __name__ == "__main__":
     main(["list"])
 """
@@ -51,7 +51,7 @@ main(["list"])
 
 
 def start(folder: Path, script: str, *words: object) -> subprocess.Popen:
-    """A program in a process group of its own, as in a terminal."""
+    """Start a program in a new process group, as a terminal does."""
     file = folder / "program.py"
     file.write_text(script)
     environment = os.environ | {"PYTHONPATH": os.getcwd(), "VD4RL_POMDP_CACHE": str(folder / "cache")}
@@ -65,51 +65,51 @@ def start(folder: Path, script: str, *words: object) -> subprocess.Popen:
     )
 
 
-def said(program: subprocess.Popen) -> list[str]:
-    """What a program that has ended said on stderr, progress left out."""
+def stderr_lines(program: subprocess.Popen) -> list[str]:
+    """Wait for a program and return its lines on stderr, without progress."""
     _, error = program.communicate(timeout=60)
     return [line for line in error.splitlines() if " steps  " not in line]
 
 
-def test_a_training_run_keeps_its_running_step_and_resumes_from_there(tmp_path):
+def test_sigint_saves_a_checkpoint_of_the_current_step(tmp_path):
     data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
     words = ["pretrain", "--preset", "smoke", "--method", "acro", "--data", data, "--out", tmp_path / "run"]
     program = start(tmp_path, SLOW_STEPS, *words)
     assert program.stdout.readline() == "in step 3\n"
     program.send_signal(signal.SIGINT)
     kept = f"interrupted: {tmp_path / 'run'} keeps step 3; re-run the same command to resume"
-    assert said(program) == [kept]
+    assert stderr_lines(program) == [kept]
     assert program.returncode == 130
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["3.pt"]
     assert not list((tmp_path / "run").glob(".*"))
 
 
-def test_a_signal_while_workers_start_is_the_callers_business(tmp_path):
+def test_sigterm_during_worker_start_ends_all_processes(tmp_path):
     program = start(tmp_path, SLOW_JOBS)
     children = Path(f"/proc/{program.pid}/task/{program.pid}/children")
     if not children.exists():
         program.kill()
         pytest.skip("this system does not list children")
-    while len(pids := children.read_text().split()) < 3:  # two workers, and the tracker of their resources
+    while len(pids := children.read_text().split()) < 3:  # two workers and the resource tracker
         time.sleep(0.01)
-    os.killpg(program.pid, signal.SIGTERM)  # as a cluster's scancel, and a terminal's Ctrl-C, do
-    assert said(program) == ["terminated: re-run the same command to resume"]
+    os.killpg(program.pid, signal.SIGTERM)  # as scancel and a terminal's Ctrl-C do
+    assert stderr_lines(program) == ["terminated: re-run the same command to resume"]
     assert program.returncode == 143
-    while any(alive(int(pid)) for pid in pids):  # the tracker ends when it finds its caller gone
+    while any(alive(int(pid)) for pid in pids):  # the resource tracker ends once its caller is gone
         time.sleep(0.01)
 
 
-def test_a_second_signal_ends_the_program_at_once(tmp_path):
+def test_second_signal_ends_program_immediately(tmp_path):
     program = start(tmp_path, HANGING)
     assert program.stdout.readline() == "hanging\n"
     while program.poll() is None:
         program.send_signal(signal.SIGTERM)
         time.sleep(0.2)
     assert program.returncode == -signal.SIGTERM
-    assert said(program) == []
+    assert stderr_lines(program) == []
 
 
-def test_a_library_caller_gets_the_exceptions_and_its_handlers_back():
+def test_signal_handlers_are_restored():
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     handlers = [signal.getsignal(number) for number in interrupt.SIGNALS]
     try:
@@ -120,14 +120,14 @@ def test_a_library_caller_gets_the_exceptions_and_its_handlers_back():
                 signal.raise_signal(number)
             assert end.value.code == 143
         assert [signal.getsignal(number) for number in interrupt.SIGNALS] == handlers
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup has it
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup sets it
         with interrupt.handled():
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_signal_waits_for_the_end_of_a_deferred_step_except_where_it_need_not():
+def test_signals_are_deferred_within_a_step():
     steps = []
 
     def in_a_step() -> None:

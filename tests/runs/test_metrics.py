@@ -1,4 +1,4 @@
-"""Rows of metrics: what counts in a mean, and what wandb and TensorBoard get of a run, also of one that was cut."""
+"""Metrics: means, metrics.jsonl, and its mirrors in wandb and TensorBoard, also for interrupted runs."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from vd4rl_pomdp.runs.run import RunFolder
 
 
 @pytest.mark.parametrize("name", ["step", "eval/return/none"])
-def test_a_scalar_has_no_name_that_is_anothers(name):
+def test_reserved_metric_names_are_rejected(name):
     with pytest.raises(UserError, match=f"is called '{name}', which metrics.jsonl uses already"):
         Means().add({"loss": torch.tensor(1.0), name: torch.tensor(2.0)})
 
 
-def test_what_is_added_is_a_number_of_its_own_in_single_precision():
+def test_means_copy_values_in_float32():
     means, weight = Means(), torch.nn.Parameter(torch.tensor(1.0))
     for _ in range(1000):
         means.add({"weight": weight, "half": torch.tensor(1.0, dtype=torch.bfloat16)})
     with torch.no_grad():
         weight.fill_(9.0)
-    assert not any(total.requires_grad for total, _ in means.state_dict().values()), "no graph is kept alive"
+    assert not any(total.requires_grad for total, _ in means.state_dict().values()), "an autograd graph is kept"
     assert means.take() == {"weight": 1.0, "half": 1.0}
 
 
-def test_adding_reads_no_value():
-    """A meta tensor has none: reading it, which would wait for a GPU, raises."""
+def test_adding_metrics_does_not_synchronise():
+    """Reading the value of a meta tensor raises; on a GPU reading would synchronise."""
     means = Means()
     for _ in range(2):
         means.add({"loss": torch.zeros((), device="meta")})
@@ -52,7 +52,7 @@ def test_adding_reads_no_value():
         means.take()
 
 
-def test_rows_after_the_checkpoint_and_a_cut_one_are_dropped(tmp_path):
+def test_resumed_log_drops_rows_after_checkpoint(tmp_path):
     path = tmp_path / "metrics.jsonl"
     log = MetricsLog(path, 0)
     for step in (1, 2, 3):
@@ -113,7 +113,7 @@ def wandb_rows(run: Path) -> list[dict[str, float]]:
 
 
 def tensorboard_numbers(run: Path) -> dict[tuple[str, int], float]:
-    """What the run's one event file holds; each record is framed by its length."""
+    """Values by (tag, step) in the run's event file, whose records are prefixed by their length."""
     (file,) = (run / "tensorboard").iterdir()
     content, place, shown = file.read_bytes(), 0, {}
     while place < len(content):
@@ -125,7 +125,7 @@ def tensorboard_numbers(run: Path) -> dict[tuple[str, int], float]:
 
 
 def assert_all_mirrored(run: Path) -> list[dict[str, float]]:
-    """Both mirrors hold every row of a run's metrics.jsonl once, in order; returns them."""
+    """Assert that both mirrors hold every row of metrics.jsonl once and in order, and return the rows."""
     rows = read_metrics(run / "metrics.jsonl")
     assert wandb_rows(run) == rows
     expected = {(n.replace("+", "_"), r["step"]): v for r in rows for n, v in r.items() if n != "step"}
@@ -136,12 +136,12 @@ def assert_all_mirrored(run: Path) -> list[dict[str, float]]:
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_both_get_the_whole_config_and_every_row_also_of_a_run_that_was_cut(encoder, data, tmp_path, monkeypatch):
+def test_trackers_get_config_and_all_rows_of_a_resumed_run(encoder, data, tmp_path, monkeypatch):
     changes = FINETUNE | {"wandb": "offline", "tensorboard": True}
     with monkeypatch.context() as patch:
         cut_at(patch, 2)
         with pytest.raises(CutError):
-            run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))  # mirrored from its second part
+            run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))  # tracked only after resuming
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes)).path
     first = next(record.run for record in wandb_records(run) if record.HasField("run"))
     assert first.run_id == (run / "wandb" / "id").read_text()
@@ -150,14 +150,14 @@ def test_both_get_the_whole_config_and_every_row_also_of_a_run_that_was_cut(enco
     config = {item.key: json.loads(item.value_json) for item in first.config.update}
     stored = json.loads((run / "config.json").read_text())
     assert (stored["config"] | {"wandb": "offline", "tensorboard": True}).items() <= config.items()
-    told = {name: config[name] for name in ("method", "corruption", "task", "quality", "stage")}
-    assert told == {**LABELS, "corruption": "patch+zero_frames", "stage": "finetune"}
+    labels = {name: config[name] for name in ("method", "corruption", "task", "quality", "stage")}
+    assert labels == {**LABELS, "corruption": "patch+zero_frames", "stage": "finetune"}
     assert config["pretraining"] == json.loads((encoder / "config.json").read_text())["pretrain"]
     rows = assert_all_mirrored(run)
     assert "eval/score/none" in rows[-1]
     untracked = contents(run_finetune(smoke_finetune(encoder, data, tmp_path / "untracked", **FINETUNE)).path)
     tracked = contents(run)
-    assert [name for name in untracked if untracked[name] != tracked.get(name)] == ["config.json"], "its flags alone"
+    assert [name for name in untracked if untracked[name] != tracked.get(name)] == ["config.json"], "only flags differ"
 
 
 KILLED = """
@@ -176,13 +176,13 @@ if __name__ == "__main__":
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_no_mirror_of_a_killed_run_lacks_a_row(data, tmp_path):
+def test_trackers_get_all_rows_of_a_killed_run(data, tmp_path):
     out, script = tmp_path / "run", tmp_path / "killed.py"
     script.write_text(KILLED)
     changes = {"method": "no_history", "log_every": 1, "checkpoint_every": 30, "steps": 50, "wandb": "offline"}
     words = ["pretrain", "--preset", "smoke", "--data", data, "--out", out, "--corruption", "patch", "--tensorboard"]
     words += [word for name, value in changes.items() for word in (f"--{name.replace('_', '-')}", value)]
-    apart = {name: value for name, value in os.environ.items() if name != "WANDB_SERVICE"}  # a process of its own
+    apart = {name: value for name, value in os.environ.items() if name != "WANDB_SERVICE"}  # not this process's
     command = [sys.executable, script, *words]
     killed = subprocess.run(list(map(str, command)), env=apart | {"PYTHONPATH": os.getcwd()}, capture_output=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -192,7 +192,7 @@ def test_no_mirror_of_a_killed_run_lacks_a_row(data, tmp_path):
 
 
 class Faulty(ModuleType):
-    """A wandb that fails at one of its calls."""
+    """A fake wandb that raises in one of its functions."""
 
     def __init__(self, place: str = "nothing") -> None:
         super().__init__("wandb")
@@ -218,7 +218,7 @@ class Faulty(ModuleType):
 
 
 @pytest.mark.parametrize("place", ["init", "log", "finish"])
-def test_a_failing_wandb_warns_once_and_metrics_go_on(tmp_path, monkeypatch, capsys, place):
+def test_wandb_failure_warns_once(tmp_path, monkeypatch, capsys, place):
     monkeypatch.setitem(sys.modules, "wandb", faulty := Faulty(place))
     log = open_log(run_at(tmp_path, wandb="online"))
     for step in (1, 2, 3):
@@ -230,8 +230,8 @@ def test_a_failing_wandb_warns_once_and_metrics_go_on(tmp_path, monkeypatch, cap
     assert len(read_metrics(tmp_path / "metrics.jsonl")) == 3
 
 
-def test_a_disk_that_fills_under_tensorboard_warns_once(tmp_path, monkeypatch, capsys):
-    """In this thread: tensorboardX's writer would wait for one that has died."""
+def test_tensorboard_failure_warns_once(tmp_path, monkeypatch, capsys):
+    """Runs in this thread: tensorboardX's writer would wait for a thread that died."""
     log = open_log(run_at(tmp_path, tensorboard=True))
 
     def full(*_: Any) -> None:
@@ -247,7 +247,7 @@ def test_a_disk_that_fills_under_tensorboard_warns_once(tmp_path, monkeypatch, c
 @pytest.mark.parametrize(
     ("changes", "module"), [({"wandb": "offline"}, "wandb"), ({"tensorboard": True}, "tensorboardX")]
 )
-def test_what_is_not_installed_is_named_with_what_brings_it(tmp_path, monkeypatch, capsys, changes, module):
+def test_missing_tracker_names_its_extra(tmp_path, monkeypatch, capsys, changes, module):
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
@@ -256,7 +256,7 @@ def test_what_is_not_installed_is_named_with_what_brings_it(tmp_path, monkeypatc
     assert read_metrics(tmp_path / "metrics.jsonl") == [{"step": 1, "loss": 0.5}]
 
 
-def test_online_a_run_that_resumes_is_the_same_and_gets_the_rows_that_the_server_lacks(tmp_path, monkeypatch):
+def test_resumed_online_run_sends_missing_rows(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", fake := Faulty())
     run, other = (run_at(tmp_path / name, wandb="online") for name in "ab")
     log = open_log(run)
@@ -271,13 +271,13 @@ def test_online_a_run_that_resumes_is_the_same_and_gets_the_rows_that_the_server
     assert all((words["resume"], words["mode"]) == ("allow", "online") for words in fake.asked)
 
 
-def test_seeds_of_one_experiment_share_a_group_and_other_settings_do_not(tmp_path):
+def test_seeds_share_a_wandb_group(tmp_path):
     one, other, wide = (wandb_names(run_at(tmp_path, **c), LABELS, {}) for c in ({}, {"seed": 1}, {"max_k": 15}))
     assert one["group"] == other["group"] != wide["group"]
     assert (one["name"], other["name"]) == tuple(f"pretrain mik+a walker_walk expert patch seed {i}" for i in (0, 1))
     card = {"settings": {"max_k": 1}, "seed": 0, "method": "mik+a"}
     cards = [card, card | {"seed": 1}, card | {"settings": {"max_k": 2}}]
-    assert len({wandb_names(run_at(tmp_path), LABELS, told)["group"] for told in cards}) == 2
+    assert len({wandb_names(run_at(tmp_path), LABELS, card)["group"] for card in cards}) == 2
     long = wandb_names(run_at(tmp_path, seed=2**31 - 1), LABELS | {"method": "m" * 300}, {})
     assert (len(long["name"]), len(long["group"]), max(map(len, long["tags"]))) == (128, 128, 64)
     assert long["name"].endswith(" seed 2147483647")

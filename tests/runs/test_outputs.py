@@ -1,4 +1,4 @@
-"""No command writes over a run, a policy, an encoder or a data set, nor inside one, nor where another one writes."""
+"""Commands neither overwrite nor write into a run, policy, encoder or dataset, or a folder in use."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ def fill(folder: Path, **files: str) -> Path:
 
 @pytest.fixture
 def kept(tmp_path) -> dict[str, Path]:
-    """A folder of every kind that owns its files."""
+    """One folder of every kind that owns its files."""
     run = {"stage": "finetune", "config": {}, "versions": {}, "git_commit": "", "command": ""}
     return {
         "a run": fill(tmp_path / "run", config__json=json.dumps(run), episodes__csv=""),
@@ -41,13 +41,13 @@ def contents(folder: Path) -> dict[str, str]:
     return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_what_another_program_left_is_no_run(tmp_path):
+def test_foreign_config_files_are_no_runs(tmp_path):
     for name, text in {"package": "[1]", "broken": "{"}.items():
         assert kept_in(fill(tmp_path / name, config__json=text)) is None
     assert kept_in(tmp_path / "nowhere") is None
 
 
-def test_links_into_what_is_kept_are_refused_and_an_own_earlier_folder_is_not(kept, tmp_path):
+def test_output_inside_owned_folders_is_rejected(kept, tmp_path):
     for what, folder in kept.items():
         with pytest.raises(UserError, match=f"lies inside .* holds {what.strip()}; choose another folder"):
             refuse_inside(folder / ".." / folder.name / "not" / "there" / "yet.csv")
@@ -55,7 +55,7 @@ def test_links_into_what_is_kept_are_refused_and_an_own_earlier_folder_is_not(ke
     with pytest.raises(UserError, match="lies inside"):
         refuse_inside(tmp_path / "link" / "new")
     (tmp_path / "loop").symlink_to("loop")
-    refuse_inside(tmp_path / "loop" / "new")  # is inside nothing that is kept; writing there says what is wrong
+    refuse_inside(tmp_path / "loop" / "new")  # inside no owned folder; writing there reports the loop
     with pytest.raises(UserError, match="is not empty and holds no report"):
         refuse_foreign(fill(tmp_path / "papers", thesis__tex="words"), "report", "summary.csv")
     for mine in (tmp_path / "new", fill(tmp_path / "empty"), fill(tmp_path / "earlier", summary__csv="")):
@@ -63,7 +63,7 @@ def test_links_into_what_is_kept_are_refused_and_an_own_earlier_folder_is_not(ke
 
 
 def commands(data: Path, run: Path) -> dict[str, list[str]]:
-    """Words of every command that has an --out, with nothing else wrong."""
+    """Valid arguments, without --out, of every command that has an --out."""
     preset = ["--preset", "smoke"]
     return {
         "demo": ["demo"],
@@ -93,12 +93,12 @@ FILES = ("evaluate", "data view", "navigation policy")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_command_writes_into_what_another_owns(name, kept, tmp_path, capsys, monkeypatch):
+def test_commands_do_not_write_into_owned_folders(name, kept, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     fill(tmp_path / "trained", config__json='{"task": "walker_walk"}', curve__csv="decisions,return_mean\n")
     for folder in kept.values():
         places = [folder / "inside"] if name not in FILES else [folder / "inside.csv", folder / "not" / "there.csv"]
-        if name not in (*FILES, "pretrain", "finetune", "navigation train"):  # which look at their data first
+        if name not in (*FILES, "pretrain", "finetune", "navigation train"):  # these check their data first
             places.append(folder)
         for out in places:
             before = contents(tmp_path)
@@ -112,7 +112,7 @@ def test_no_command_writes_into_what_another_owns(name, kept, tmp_path, capsys, 
             assert contents(tmp_path) == before
 
 
-def test_every_command_with_an_out_is_tried(capsys):
+def test_all_commands_with_out_are_covered(capsys):
     from vd4rl_pomdp.cli import COMMANDS
 
     with_out = set()
@@ -134,7 +134,7 @@ with owned(Path(sys.argv[1])):
 """
 
 
-def test_a_second_process_is_told_who_holds_a_folder_until_that_one_dies(tmp_path):
+def test_folder_in_use_names_its_process_until_it_dies(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.getcwd()}
     with subprocess.Popen(
         [sys.executable, "-c", HOLDER, tmp_path / "run"], stdout=subprocess.PIPE, text=True, env=environment
@@ -142,8 +142,8 @@ def test_a_second_process_is_told_who_holds_a_folder_until_that_one_dies(tmp_pat
         assert holder.stdout is not None
         assert holder.stdout.readline() == "owned\n"
         assert in_use(tmp_path / "run")
-        told = rf"run: is in use by process {holder.pid} on {socket.gethostname()} since \d{{4}}-\d\d-\d\d .* UTC; wait"
-        with pytest.raises(UserError, match=told), owned(tmp_path / "run"):
+        line = rf"run: is in use by process {holder.pid} on {socket.gethostname()} since \d{{4}}-\d\d-\d\d .* UTC; wait"
+        with pytest.raises(UserError, match=line), owned(tmp_path / "run"):
             pass
         holder.send_signal(signal.SIGKILL)
     assert not in_use(tmp_path / "run")

@@ -8,7 +8,7 @@ class Clock:
         return self.now
 
 
-def test_a_plain_log_shows_numbers_speed_and_time_left_by_count_and_by_time(capsys):
+def test_progress_lines_show_loss_speed_and_eta(capsys):
     clock = Clock()
     with ProgressLine("train", 1000, "steps", clock=clock) as progress:
         for step in range(1, 201):
@@ -23,7 +23,7 @@ def test_a_plain_log_shows_numbers_speed_and_time_left_by_count_and_by_time(caps
     assert lines[-1].startswith("train: 200/1000 steps  loss 0.005  0.19 steps/s  ETA 1:")
 
 
-def test_more_steps_than_planned_leave_no_time(capsys):
+def test_eta_is_zero_beyond_planned_steps(capsys):
     clock = Clock()
     with ProgressLine("PPO", 100, "decisions", clock=clock) as progress:
         clock.now = 1.0
@@ -31,7 +31,7 @@ def test_more_steps_than_planned_leave_no_time(capsys):
     assert capsys.readouterr().err == "PPO: 200/100 decisions  200 decisions/s  ETA 0:00:00\n"
 
 
-def test_a_fast_log_has_ten_lines_and_a_resumed_one_counts_its_own_speed(capsys):
+def test_resumed_progress_prints_ten_lines_with_current_speed(capsys):
     clock = Clock()
     with ProgressLine("train", 1000, "steps", start=500, clock=clock) as progress:
         for _ in range(500):

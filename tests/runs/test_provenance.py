@@ -28,14 +28,14 @@ def checkout(tmp_path) -> Path:
     return root
 
 
-def test_a_checkout_of_this_project_tells_its_commit(checkout):
+def test_checkout_commit_marks_local_changes(checkout):
     head = git(checkout, "rev-parse", "HEAD")
     assert checkout_commit(checkout) == head
     (checkout / "pyproject.toml").write_text('[project]\nname = "vd4rl-pomdp"\nversion = "2"\n')
     assert checkout_commit(checkout) == f"{head}+"
 
 
-def test_a_repository_around_the_package_is_another_project(checkout, monkeypatch):
+def test_enclosing_repository_of_another_project_is_ignored(checkout, monkeypatch):
     site = checkout / ".venv" / "lib" / "site-packages"
     (site / "vd4rl_pomdp" / "runs").mkdir(parents=True)
     assert checkout_commit(site) == ""
@@ -49,7 +49,7 @@ def test_a_repository_around_the_package_is_another_project(checkout, monkeypatc
     assert provenance.git_commit() == "abc"
 
 
-def test_a_wheel_carries_the_commit_it_was_built_from(checkout):
+def test_wheel_contains_its_commit(checkout):
     """The real setup.py on a package of one module, without fetching anything."""
     for name in ("setup.py", "vd4rl_pomdp/runs/provenance.py"):
         (checkout / name).parent.mkdir(exist_ok=True)
@@ -77,13 +77,13 @@ def test_a_wheel_carries_the_commit_it_was_built_from(checkout):
         ("my_method.py", "my_method.py"),
     ],
 )
-def test_the_command_line_is_named_as_it_would_be_typed(monkeypatch, script, program):
+def test_command_is_recorded_as_typed(monkeypatch, script, program):
     monkeypatch.setattr("sys.argv", [script, "--out", "a b"])
     assert command() == f"{program} --out 'a b'"
 
 
 @pytest.mark.parametrize(("device", "named"), [("cpu", None), ("cuda:1", "card 1"), ("auto", "card None")])
-def test_a_run_names_the_card_that_it_had_not_the_machines_first(monkeypatch, device, named):
+def test_machine_names_the_gpu_in_use(monkeypatch, device, named):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda used: f"card {used.index}")

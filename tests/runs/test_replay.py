@@ -1,4 +1,4 @@
-"""Steps that are replayed against steps that are run, on a CPU, where a recorder plays the CUDA graph's part."""
+"""Replayed against eager steps on a CPU, where a recorder stands in for the CUDA graph."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CPU = torch.device("cpu")
 
 
 class Regression:
-    """A small training: a batch by index, noise, a target network, a second part in every other step."""
+    """A small training: sampled batches, noise, a target network, and an extra update in every other step."""
 
     def __init__(self) -> None:
         torch.manual_seed(0)
@@ -50,14 +50,14 @@ class Regression:
 
 
 def train(made: Regression, steps: int, capture: Any = None, begun: int = 0) -> list[dict[str, float]]:
-    """The scalars of every step, read after the last."""
+    """The scalars of every step, read after the last step."""
     replay = Replay(made.step, CPU, [made.draws], 2, [made], capture)
     logs = [replay(step % 2) for step in range(begun, begun + steps)]
     return [{name: float(value) for name, value in row.items()} for row in logs]
 
 
-def test_replayed_steps_are_those_that_are_run() -> None:
-    """Batches, noise, learning rate, targets and the second turn, over more than a block; read late."""
+def test_replayed_steps_equal_eager_steps() -> None:
+    """Batches, noise, learning rate, targets and the second turn, over more than one block of draws."""
     run, replayed = Regression(), Regression()
     expected, got = train(run, BLOCK + 30), train(replayed, BLOCK + 30, record)
     assert [row.keys() for row in got] == [row.keys() for row in expected]
@@ -67,8 +67,8 @@ def test_replayed_steps_are_those_that_are_run() -> None:
         torch.testing.assert_close(one, other)
 
 
-def test_a_state_is_that_of_the_steps_made_however_they_were_drawn() -> None:
-    """A replayed training saves what one that is run would, and either goes on from it."""
+def test_state_does_not_depend_on_prefetched_draws() -> None:
+    """Replayed and eager training save the same state, and either resumes from it."""
     run, replayed = Regression(), Regression()
     train(run, 41)
     train(replayed, 41, record)
@@ -89,7 +89,7 @@ def test_a_state_is_that_of_the_steps_made_however_they_were_drawn() -> None:
 class Reads(Regression):
     def step(self, turn: int) -> dict[str, Tensor]:
         logs = super().step(turn)
-        if logs["loss"] < -1:  # Python decides by a value
+        if logs["loss"] < -1:  # control flow that depends on a value
             raise AssertionError
         return logs
 
@@ -120,10 +120,10 @@ class Draws(Regression):
     ("made", "reason"),
     [(Reads, "item|local_scalar"), (Counts, "count"), (Rebinds, "mean"), (Draws, "randn")],
 )
-def test_what_cannot_be_replayed_is_run_and_told_once(
+def test_steps_that_cannot_be_captured_run_eagerly_with_one_warning(
     made: type[Regression], reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The same numbers as without, and one line."""
+    """The numbers equal those without capture."""
     torch.manual_seed(0)
     expected = train(made(), 40)
     torch.manual_seed(0)
@@ -132,13 +132,13 @@ def test_what_cannot_be_replayed_is_run_and_told_once(
         row.pop("own", None)
         other.pop("own", None)
         assert row == pytest.approx(other, rel=1e-4)
-    told = capsys.readouterr().err
-    assert told.count("warning") == 1
-    assert [word for word in reason.split("|") if word in told]
+    stderr = capsys.readouterr().err
+    assert stderr.count("warning") == 1
+    assert [word for word in reason.split("|") if word in stderr]
 
 
-def test_draws_that_are_not_replayed_leave_nothing_behind() -> None:
-    """A training on a CPU makes a million."""
+def test_eager_draws_do_not_accumulate_memory() -> None:
+    """CPU training makes a million draws."""
     draws = RandomStream(torch.Generator().manual_seed(0))
     draws.integers(10, 4)
     tracemalloc.start()

@@ -1,4 +1,4 @@
-"""A run folder: begun by one process, resumed as the same run only, and named by what it computes."""
+"""A run folder has one owner, resumes only the same run, and is identified by what it computes."""
 
 import copy
 import json
@@ -32,7 +32,7 @@ def begin(out: Path, inputs: dict[str, str] = INPUTS, **changes: object) -> RunF
     return RunFolder(out, "stage", Config(out, **changes), inputs, collection={"task": "mine"})
 
 
-def test_only_the_same_run_resumes_wherever_its_data_lies(tmp_path):
+def test_only_the_same_run_resumes(tmp_path):
     with begin(tmp_path) as run:
         assert not any(path.name.endswith(".tmp") for path in tmp_path.iterdir())
         run.finish()
@@ -58,14 +58,14 @@ def test_only_the_same_run_resumes_wherever_its_data_lies(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["thesis.txt", "config.json"])
-def test_a_folder_with_something_else_is_refused(tmp_path, content):
+def test_foreign_folder_is_rejected(tmp_path, content):
     (tmp_path / content).write_text("{}")
     with pytest.raises(UserError, match="is not empty and holds no run"):
         begin(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [content]
 
 
-def test_the_record_is_of_the_start_that_counts_and_tells_what_later_ones_had(tmp_path, monkeypatch):
+def test_record_lists_machines_and_commits_of_resumptions(tmp_path, monkeypatch):
     now = {}
     monkeypatch.setattr(module, "machine", lambda device: {"processor": now["processor"]})
     monkeypatch.setattr(module, "git_commit", lambda: now["git_commit"])
@@ -75,14 +75,14 @@ def test_the_record_is_of_the_start_that_counts_and_tells_what_later_ones_had(tm
         with begin(tmp_path) as run:
             if commit != "lost":
                 run.save(1, {})
-    record, told = (read_json(tmp_path / f"{name}.json") for name in ("config", "machine"))
-    later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
-    assert (record["git_commit"], told["processor"]) == ("one", "A")
+    record, machine = (read_json(tmp_path / f"{name}.json") for name in ("config", "machine"))
+    later = [(part["processor"], part["git_commit"]) for part in machine["continued"]]
+    assert (record["git_commit"], machine["processor"]) == ("one", "A")
     assert later == [("B", "one"), ("B", "two"), ("A", "one")]
-    assert told["continued"][0]["versions"] == record["versions"]
+    assert machine["continued"][0]["versions"] == record["versions"]
 
 
-def test_a_second_owner_is_refused_and_finds_the_end_of_the_first(tmp_path):
+def test_run_in_use_is_rejected(tmp_path):
     with begin(tmp_path) as run:
         second = begin(tmp_path)
         with pytest.raises(UserError, match=f"in use by process {os.getpid()}"), second:
@@ -98,8 +98,8 @@ def _begin_and_save(out: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_run_that_is_killed_at_its_beginning_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "git_commit", lambda: "")  # which starts a process, hundreds of times
+def test_run_killed_at_any_system_call_resumes(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "git_commit", lambda: "")  # else hundreds of subprocesses
     monkeypatch.setattr(module, "versions", dict)
     for number in range(1, 200):
         out = tmp_path / str(number)
@@ -113,11 +113,11 @@ def test_a_run_that_is_killed_at_its_beginning_resumes(tmp_path, monkeypatch):
     assert 10 < number < 199
 
 
-def test_seconds_of_all_parts_add_up(tmp_path):
+def test_timing_adds_up_over_resumptions(tmp_path):
     with begin(tmp_path) as run:
         run._started -= 100.0
         run.save(1, {})
-        run._started -= 1000.0  # lost with what follows the checkpoint
+        run._started -= 1000.0  # after the checkpoint, so it is lost
     with begin(tmp_path) as again:
         again.restore(lambda state: None)
         again._started -= 10.0
@@ -127,7 +127,7 @@ def test_seconds_of_all_parts_add_up(tmp_path):
     assert timing["total_seconds"] >= timing["seconds"] - 0.1
 
 
-def test_all_files_follow_the_umask(tmp_path):
+def test_files_follow_the_umask(tmp_path):
     before = os.umask(0o027)
     try:
         with begin(tmp_path / "run") as run:
@@ -148,7 +148,7 @@ RECORD = {
 }
 CARD = {"settings": {"steps": 20, "method": "acro"}, "seed": 0, "data": "f00d"}
 BOTH, NEITHER, IDENTITY = (True, True), (False, False), (False, True)
-"""Whether a change makes another recipe, and another identity."""
+"""Whether a change gives another recipe and another identity."""
 
 
 def _changed(value, place, new):
@@ -167,18 +167,18 @@ def _changed(value, place, new):
         *(("inputs.encoder", "x", NEITHER), ("inputs.data", "0ff", IDENTITY), ("card.data", "0ff", IDENTITY)),
         *(("config.seed", 1, BOTH), ("config.updates", 41, BOTH), ("format", 4, BOTH), ("stage", "pretrain", BOTH)),
         *(("card.seed", 1, BOTH), ("card.settings.steps", 21, BOTH), ("card.settings.future_frames", "newest", BOTH)),
-        # settings of a later version count where they change what all did before
+        # settings of later versions count only where they differ from the earlier behaviour
         *(("config.future_frames", "all", NEITHER), ("config.future_frames", "newest", BOTH)),
         *(("config.view_seed", None, NEITHER), ("config.view_seed", 0, BOTH), ("config.view_seed", 1, BOTH)),
     ],
 )
-def test_a_run_is_named_by_what_it_computes(place, new, other):
+def test_recipe_and_identity_depend_on_settings(place, new, other):
     changed = _changed(RECORD | {"card": CARD}, place, new)
     both = ((function(RECORD, CARD), function(changed, changed["card"])) for function in (recipe, identity))
     assert tuple(before != after for before, after in both) == other
 
 
-def test_images_of_a_folder_are_told_by_their_content_and_made_ones_by_their_name():
+def test_identity_hashes_image_folder_content():
     def named(exogenous, content):
         return identity(_changed(_changed(RECORD, "config.exogenous", exogenous), "inputs.exogenous", content), {})
 

@@ -1,4 +1,4 @@
-"""Jobs over worker processes: in order, their errors told, and no process left however the caller ends."""
+"""Jobs in worker processes: ordered results, errors raised in the parent, and no process left."""
 
 import multiprocessing
 import multiprocessing.connection
@@ -15,15 +15,15 @@ from vd4rl_pomdp.core.errors import DiskFullError, UserError, WorkerDiedError
 from vd4rl_pomdp.runs.workers import count_workers, kept_workers, run_jobs
 
 PARENT = """
-from tests.runs.test_workers import tell_and_sleep
+from tests.runs.test_workers import print_pid_and_sleep
 from vd4rl_pomdp.runs.workers import run_jobs
 if __name__ == "__main__":
-    list(run_jobs(tell_and_sleep, [0, 1], 2))
+    list(run_jobs(print_pid_and_sleep, [0, 1], 2))
 """
 
 
-def tell_and_sleep(job: int) -> None:
-    os.write(1, f"{os.getpid()}\n".encode())  # at once: `print` may write the line's end apart, and there are two
+def print_pid_and_sleep(job: int) -> None:
+    os.write(1, f"{os.getpid()}\n".encode())  # atomic; `print` of two processes may interleave
     time.sleep(60)
 
 
@@ -49,27 +49,27 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_results_come_in_order(workers):
+def test_job_results_keep_their_order(workers):
     assert list(run_jobs(act, ["a", "b", "c", "d", "e"], workers)) == ["A", "B", "C", "D", "E"]
     assert count_workers(0) >= 1
     assert count_workers(3) == 3
 
 
 @pytest.mark.parametrize(
-    ("job", "kind", "told"),
+    ("job", "kind", "message"),
     [
         ("refuse", DiskFullError, "^run: the disk is full$"),
         ("die", WorkerDiedError, "a worker process ended before its job: .* use fewer --workers"),
         (lambda: None, UserError, r"a job cannot be sent to a worker process \(.*lambda.*\): .* --workers 1"),
     ],
 )
-def test_what_goes_wrong_in_a_job_is_raised_here(job, kind, told):
-    with pytest.raises(kind, match=told):
+def test_worker_errors_are_raised_in_the_parent(job, kind, message):
+    with pytest.raises(kind, match=message):
         list(run_jobs(act, [job, "b"], 2))
     assert not multiprocessing.active_children()
 
 
-def test_a_killed_parent_leaves_no_workers(tmp_path):
+def test_killed_parent_leaves_no_workers(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
     environment = os.environ | {"PYTHONPATH": os.getcwd()}
@@ -86,8 +86,8 @@ def test_a_killed_parent_leaves_no_workers(tmp_path):
     assert not any(map(alive, workers))
 
 
-def test_results_that_nobody_takes_leave_no_workers():
-    results = run_jobs(tell_and_sleep, [0, 1], 2)
+def test_interrupted_iteration_leaves_no_workers():
+    results = run_jobs(print_pid_and_sleep, [0, 1], 2)
     main = threading.main_thread().ident
     threading.Timer(1.0, lambda: signal.pthread_kill(main, signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
@@ -95,9 +95,9 @@ def test_results_that_nobody_takes_leave_no_workers():
     assert not multiprocessing.active_children()
 
 
-def test_workers_that_are_kept_serve_again_until_one_dies_or_more_are_wanted():
+def test_kept_workers_are_reused_until_one_dies():
     def serving(workers: int) -> set[int]:
-        list(run_jobs(number_of_process, range(workers), workers))  # one of them may be fast enough to do all
+        list(run_jobs(number_of_process, range(workers), workers))  # one worker may be fast enough to do all jobs
         return {child.pid for child in multiprocessing.active_children() if child.pid}
 
     with kept_workers():

@@ -1,4 +1,4 @@
-"""Means with intervals or standard errors that the pages quote in sentences are those of committed rows."""
+"""Means with intervals or standard errors quoted in sentences on the pages match committed rows."""
 
 import importlib
 import itertools
@@ -23,9 +23,9 @@ from vd4rl_pomdp.studies.navigation.runs import online_error, refitted_error
 ROOT = Path(__file__).parents[3]
 QUOTED = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?|[-+]?\d+(?: more| less| above it)? \[-?\d+, -?\d+\]")
 GENERATED = re.compile(r"<!-- table: .* -->\n(?:\|.*\n)*")
-"""Tables that scripts write, which tests/tools/test_scripts.py holds against rows."""
+"""Tables that scripts write; tests/tools/test_scripts.py compares them with the rows."""
 MAIN = ("control", "offline")
-"""Folders whose rows count as one."""
+"""Folders whose rows are pooled."""
 ASIDE = ("control/budget", "control/histories", "control/expert")
 REPORTS = sorted(found.parent for found in (ROOT / "results" / "navigation").rglob("tables.csv"))
 MEASURES = (
@@ -33,7 +33,7 @@ MEASURES = (
     *(refitted_error(component) for component in ("state", "position", "velocity")),
     *(refitted_error(component).raw() for component in ("state", "position", "velocity")),
 )
-"""Of mazes: the paper's way and units, and the refitted probe's in both units."""
+"""Navigation: the paper's online probe in its units, and the refitted probe in both units."""
 Estimate = tuple[float, float]
 """A mean and its standard error."""
 
@@ -56,7 +56,7 @@ def with_differences(estimates: Iterable[Estimate | None], digits: int) -> Itera
 
 
 def of_returns(folders: Iterable[str]) -> Iterator[str]:
-    """Of methods on one set, whatever was hidden from them, and of the same played clean; of each run over episodes."""
+    """Quotable returns of methods on one set, under all corruptions and clean, and of single runs."""
     groups = defaultdict(lambda: defaultdict(list))
     for run in load_runs([ROOT / "results" / name for name in folders]):
         if run.rows and run.finished:
@@ -70,7 +70,7 @@ def of_returns(folders: Iterable[str]) -> Iterator[str]:
 
 
 def of_shifts() -> Iterator[str]:
-    """Of `acro` as its authors shift it, which another folder has, beside `acro` as the grids train it."""
+    """Quotable returns of `acro` with its authors' random shift, compared with `acro` as the grids train it."""
     runs = [run for name in ("control", "control/budget") for run in load_runs([ROOT / "results" / name])]
     groups = defaultdict(list)
     for run in runs:
@@ -88,7 +88,7 @@ def intervals(returns: list[np.ndarray]) -> Iterator[str]:
 
 
 def of_agents() -> Iterator[str]:
-    """Of the episodes in the cards of the agents that ship, under the corruption of their training."""
+    """Quotable returns of shipped agents under their training corruption."""
     for name in shipped():
         card = read_json(SHIPPED / name / "card.json")
         rows = [row for row in card["episodes"] if row["evaluated_under"] == card["corruption"]["corruption"]]
@@ -96,7 +96,7 @@ def of_agents() -> Iterator[str]:
 
 
 def of_mazes(script: ModuleType) -> Iterator[str]:
-    """Of the pages' measures in every maze; differences only between settings of one method in one maze."""
+    """Quotable errors in every maze; differences only between settings of one method in one maze."""
     numbers = script.numbers_in()
     conditions = defaultdict(set)
     for run in script.main_runs():
@@ -121,7 +121,7 @@ def known() -> set[str]:
 
 
 def unknown(text: str, known: set[str]) -> list[str]:
-    """What is quoted and in no row; words may stand between a difference and its interval."""
+    """Quoted numbers that no row supports; words may separate a difference from its interval."""
     return [
         found for found in QUOTED.findall(text) if re.sub(r" (more|less|above it)", "", found).lstrip("+") not in known
     ]
@@ -140,7 +140,7 @@ def unknown(text: str, known: set[str]) -> list[str]:
         ("results/navigation/README.md", 7),
     ],
 )
-def test_what_a_page_tells_is_in_the_rows(page, least, known):
+def test_quoted_intervals_match_committed_rows(page, least, known):
     text = GENERATED.sub("", (ROOT / page).read_text(encoding="utf-8"))
     assert len(QUOTED.findall(text)) >= least
     assert unknown(text, known) == []
@@ -149,12 +149,12 @@ def test_what_a_page_tells_is_in_the_rows(page, least, known):
 @pytest.mark.parametrize(
     "text", ["`mik+a` returns 521 [321, 720]", "`mik` less `acro` +180 [106, 253]", "by 5.15 ± 0.11"]
 )
-def test_what_no_row_says_is_found(text, known):
+def test_unsupported_quotes_are_found(text, known):
     assert unknown(text, known) == QUOTED.findall(text)
 
 
 @pytest.mark.parametrize("place", REPORTS, ids=lambda place: place.name)
-def test_a_report_on_mazes_is_what_its_rows_and_todays_code_make_of_it(place, tmp_path):
+def test_navigation_reports_are_reproducible(place, tmp_path):
     write_report([place], tmp_path / "again")
     for name in ("rows.csv", "tables.csv"):
         assert (tmp_path / "again" / name).read_text() == (place / name).read_text(), name

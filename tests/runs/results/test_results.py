@@ -1,4 +1,4 @@
-"""Results folders: they hold what their runs' files hold, and lose nothing."""
+"""Results folders hold the content of their runs' files and lose nothing."""
 
 import errno
 import shutil
@@ -25,7 +25,7 @@ def _fewer_figures(monkeypatch):
 
 
 def whole_run(place: Path, seed: int = 0, score: float = 2.0) -> Path:
-    """A fine-tuning run with every small file."""
+    """A fine-tuning run with all its small files."""
     run = describe(write_run(place, "acro", seed, {5: [1.0], 10: [score]}), {"seed": seed}, data="f00", seed=seed)
     write_json(run / "machine.json", {"processor": "two cores"})
     write_json(run / "render.json", {"mujoco": "3.11.0"})
@@ -42,7 +42,7 @@ def content(run: Result) -> tuple:
     return run.id, run.files, run.step, run.losses, run.rows
 
 
-def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
+def test_results_round_trip(tmp_path):
     run, before = whole_run(tmp_path / "runs/a"), pretraining(tmp_path / "runs/b")
     added = add_results([tmp_path / "runs"], tmp_path / "out")
     assert added == "2 runs added"
@@ -58,7 +58,7 @@ def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
     assert [content(run) for run in (one, other)] == [content(read_run(path)) for path in (run, before)]
 
 
-def test_a_full_disk_leaves_the_folder_as_it_was_and_the_same_command_adds(tmp_path, monkeypatch):
+def test_full_disk_leaves_results_unchanged(tmp_path, monkeypatch):
     begin = Path.open
 
     def full(path: Path, *args, **options):
@@ -77,21 +77,21 @@ def test_a_full_disk_leaves_the_folder_as_it_was_and_the_same_command_adds(tmp_p
         assert add_results([tmp_path / "runs"], tmp_path / "out").startswith("1 run added")
 
 
-def test_a_run_that_went_on_elsewhere_names_every_machine_and_commit(tmp_path):
+def test_resumed_run_names_every_machine_and_commit(tmp_path):
     run = whole_run(tmp_path / "run")
     first = {"processor": "A", "cores": 2, "gpu": None}
     later = [first | {"git_commit": "two"}, first | {"gpu": "B", "git_commit": "two"}]
     write_json(run / "machine.json", first | {"continued": later})
     write_json(run / "config.json", read_json(run / "config.json") | {"git_commit": "one"})
-    told = read_run(run)
-    assert (told.machine, told.commit) == ("A, 2 cores then B", "one then two")
+    result = read_run(run)
+    assert (result.machine, result.commit) == ("A, 2 cores then B", "one then two")
     for damaged in ("two", [1], 5):
         write_json(run / "machine.json", first | {"continued": damaged})
         with pytest.raises(UserError, match="its files are damaged"):
             read_run(run)
 
 
-def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
+def test_added_runs_are_unique_and_never_replaced(tmp_path, capsys):
     run = whole_run(tmp_path / "runs/0")
     (whole_run(tmp_path / "runs/1", seed=1) / "timing.json").unlink()
     words = ["results", "add", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
@@ -110,7 +110,7 @@ def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("name", "taken"), [("README.md", True), ("grid.toml", True), ("notes.txt", False)])
-def test_rows_may_come_after_their_page_and_their_grid(tmp_path, name, taken):
+def test_results_folder_may_hold_page_and_grid(tmp_path, name, taken):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).touch()
     run = whole_run(tmp_path / "run")
@@ -123,7 +123,7 @@ def test_rows_may_come_after_their_page_and_their_grid(tmp_path, name, taken):
             read_results(tmp_path / "out")
 
 
-def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tmp_path):
+def test_run_without_its_last_evaluation_is_rejected(tmp_path):
     run = whole_run(tmp_path / "run")
     write_json(run / "timing.json", {"seconds": 1.0, "updates": 10})
     record = read_json(run / "config.json")
@@ -135,7 +135,7 @@ def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tm
         read_run(run)
 
 
-def test_a_diverged_run_is_a_result(tmp_path):
+def test_diverged_run_is_added(tmp_path):
     run = whole_run(tmp_path / "runs/0")
     (run / "timing.json").unlink()
     write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
@@ -144,7 +144,7 @@ def test_a_diverged_run_is_a_result(tmp_path):
     assert (found.finished, found.ending, found.diverged["step"]) == (False, 1, 7)
 
 
-def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(tmp_path):
+def test_finished_run_replaces_its_diverged_copy(tmp_path):
     run = whole_run(tmp_path / "runs/0", score=1.5)
     (run / "timing.json").rename(tmp_path / "timing.json")
     write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
@@ -160,13 +160,11 @@ def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(
     assert add_results([run], tmp_path / "out") == "1 run added"
     for out in ("out", "report"):
         assert [(found.finished, found.rows[-1]["score"]) for found in read_results(tmp_path / out)] == [(True, 2.0)]
-    assert add_results([diverged], tmp_path / "out").startswith("0 runs added, 1 there already with other rows"), (
-        "and never the other way round"
-    )
+    assert add_results([diverged], tmp_path / "out").startswith("0 runs added, 1 there already with other rows")
 
 
-def test_later_evaluations_of_a_run_are_added_to_its_rows(tmp_path):
-    """As by `evaluate --keep`: the earlier rows stay, so nothing contradicts them or would be lost."""
+def test_later_evaluations_are_added(tmp_path):
+    """As by `evaluate --keep`: earlier rows stay."""
     run = whole_run(tmp_path / "runs/0")
     add_results([run], tmp_path / "out")
     write_report([run], tmp_path / "report")
@@ -177,21 +175,19 @@ def test_later_evaluations_of_a_run_are_added_to_its_rows(tmp_path):
     ]
     append_episodes(run / "episodes.csv", kept[-1:])
     for paths in ([run, earlier], [earlier, run]):
-        assert [len(found.rows) for found in find_results(paths)] == [3], "the copy that was evaluated more"
+        assert [len(found.rows) for found in find_results(paths)] == [3], "the copy with more evaluations"
     write_report([run], tmp_path / "report")
     assert add_results([run], tmp_path / "out") == "0 runs added, 1 there already, with later evaluations added"
     for out in ("report", "out"):
         assert read_results(tmp_path / out)[0].rows == read_run(run).rows
-    assert add_results([earlier], tmp_path / "out") == "0 runs added, 1 there already", (
-        "an earlier copy takes none away"
-    )
+    assert add_results([earlier], tmp_path / "out") == "0 runs added, 1 there already"
     assert len(read_results(tmp_path / "out")[0].rows) == 3
     assert [found.path for found in find_results([tmp_path / "out", earlier])] == [tmp_path / "out"]
     with pytest.raises(UserError, match="report: holds other rows of run"):
         write_report([earlier], tmp_path / "report")
 
 
-def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
+def test_report_does_not_replace_rows_of_a_finished_run(tmp_path):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "kept")
     before = (tmp_path / "kept" / "episodes.csv").read_bytes()
     with pytest.raises(UserError, match=r"kept: holds other rows of run \w+, which would be lost"):
@@ -200,7 +196,7 @@ def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
     write_report([tmp_path / "runs"], tmp_path / "kept")
 
 
-def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
+def test_truncated_row_of_unfinished_run_is_ignored(tmp_path):
     run = whole_run(tmp_path / "runs/0")
     whole_run(tmp_path / "runs/1", seed=1)
     (run / "timing.json").unlink()
@@ -209,7 +205,7 @@ def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
     assert "unfinished" in write_report([tmp_path / "runs"], tmp_path / "report").page.read_text()
 
 
-def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
+def test_interrupted_add_keeps_earlier_results(tmp_path, monkeypatch):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
     before = [content(run) for run in read_results(tmp_path / "out")]
     replace = Path.replace
@@ -229,18 +225,18 @@ def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeyp
     assert [len(run.rows) for run in read_results(tmp_path / "out")] == [2, 2]
 
 
-def test_folders_and_results_mix_and_a_run_counts_once(tmp_path):
+def test_run_found_in_folder_and_results_counts_once(tmp_path):
     runs = grid(tmp_path)
     add_results([runs / "acro0", runs / "mik+a1"], tmp_path / "some")
-    assert [run.folder for run in find_results([tmp_path / "some", runs])].count(False) == 0, "folders know more"
+    assert [run.folder for run in find_results([tmp_path / "some", runs])].count(False) == 0, "folders take precedence"
     shutil.rmtree(runs / "acro0")
     found = find_results([runs, tmp_path / "some"])
     assert len(found) == len({run.id for run in found}) == 6
     assert [run.path for run in found if not run.folder] == [tmp_path / "some"]
 
 
-def test_runs_in_linked_folders_count_and_each_once(tmp_path):
-    """As where seeds lie on other disks; a link to a folder above must not be followed for ever."""
+def test_symlinked_runs_count_once(tmp_path):
+    """Seeds may lie on other disks; a link to a parent folder must not cause endless recursion."""
     runs = grid(tmp_path / "disk")
     (tmp_path / "mixed").mkdir()
     (tmp_path / "mixed" / "seed0").symlink_to(runs / "acro0")
@@ -248,10 +244,10 @@ def test_runs_in_linked_folders_count_and_each_once(tmp_path):
     (runs / "above").symlink_to(tmp_path)
     found = find_results([runs])
     assert len(found) == 6
-    assert {run.path.parent for run in found} == {runs}, "the real folder is named, not a link to it"
+    assert {run.path.parent for run in found} == {runs}, "the real folder is named, not a symlink"
 
 
-def test_a_results_folder_within_another_is_another_experiment(tmp_path):
+def test_nested_results_folders_are_separate(tmp_path):
     for name, seed in (("outer", 0), ("outer/inner", 1)):
         run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})
         add_results([run], tmp_path / name)
@@ -280,7 +276,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("name", "change", "words"), [(name, *case) for name, cases in BAD.items() for case in cases])
-def test_a_damaged_results_folder_is_named(tmp_path, name, change, words):
+def test_damaged_results_are_rejected(tmp_path, name, change, words):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
     file = tmp_path / "out" / name
     file.write_text(change(file.read_text()))
@@ -291,7 +287,7 @@ def test_a_damaged_results_folder_is_named(tmp_path, name, change, words):
 
 
 @pytest.mark.parametrize("place", sorted(COMMITTED.rglob("runs.jsonl")), ids=lambda place: place.parent.name)
-def test_committed_runs_say_what_they_were_made_with(place):
+def test_committed_runs_record_command_commit_and_machine(place):
     for run in read_results(place.parent):
         assert run.ending
         learns_no_actions = run.record["config"].get("method") in ("random", "state", "supervised+a")

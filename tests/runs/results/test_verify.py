@@ -1,4 +1,4 @@
-"""A stranger's rows: what their own records contradict is said, and an episode is replayed to the digit."""
+"""`results verify`: contradictions between rows and records are reported, and episodes replay exactly."""
 
 import json
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from vd4rl_pomdp.runs.results import add_results, read_results, verify_results
 
 
 def changed(results: Path, change: Callable[[dict[str, Any]], Any]) -> list[str]:
-    """What is said of a results folder whose first run's line was changed."""
+    """Change the first run's line of a results folder and return the contradictions found."""
     first, *others = (results / "runs.jsonl").read_text().splitlines()
-    told = json.loads(first)
-    change(told)
-    (results / "runs.jsonl").write_text("\n".join([json.dumps(told), *others]) + "\n")
+    line = json.loads(first)
+    change(line)
+    (results / "runs.jsonl").write_text("\n".join([json.dumps(line), *others]) + "\n")
     return verify_results(results)[1]
 
 
@@ -37,22 +37,22 @@ def results(tmp_path) -> Path:
 @pytest.mark.parametrize(
     "folder", sorted({path.parent for path in COMMITTED.rglob("runs.jsonl")}), ids=lambda p: p.name
 )
-def test_the_committed_rows_contradict_nothing(folder):
+def test_committed_results_verify(folder):
     assert verify_results(folder)[1] == []
 
 
-def test_an_id_is_computed_anew_from_every_part_of_the_record_that_decides_a_number(results):
+def test_verify_recomputes_run_id_from_record(results):
     first, second = read_results(results)
     assert verify_results(results)[1] == []
-    (told,) = changed(results, lambda told: told["config"]["inputs"].update(data="f01"))
-    assert told.startswith(f"run {first.id}: its record computes ")
-    assert len(changed(results, lambda told: told["config"]["inputs"].update(data="f00"))) == 0
-    assert len(changed(results, lambda told: told["config"]["config"].update(updates=11))) == 1
-    assert second.id not in told
+    (found,) = changed(results, lambda line: line["config"]["inputs"].update(data="f01"))
+    assert found.startswith(f"run {first.id}: its record computes ")
+    assert len(changed(results, lambda line: line["config"]["inputs"].update(data="f00"))) == 0
+    assert len(changed(results, lambda line: line["config"]["config"].update(updates=11))) == 1
+    assert second.id not in found
 
 
 def edited(results: Path, row: int, **cells: str) -> None:
-    """Write into a row of episodes.csv."""
+    """Overwrite cells of a row of episodes.csv."""
     path = results / "episodes.csv"
     head, *rows = [line.split(",") for line in path.read_text().splitlines()]
     for name, value in cells.items():
@@ -60,7 +60,7 @@ def edited(results: Path, row: int, **cells: str) -> None:
     path.write_text("".join(",".join(line) + "\n" for line in [head, *rows]))
 
 
-def test_episodes_are_of_the_run_that_they_name_each_once_and_scored_by_their_returns(results, capsys):
+def test_verify_command_reports_contradictory_episodes(results, capsys):
     first, _ = read_results(results)
     edited(results, 0, seed="7", step="10", score="99.0")  # the other row's step
     with pytest.raises(SystemExit) as ended:
@@ -105,53 +105,51 @@ EDITED_RECORDS = [
 ]
 
 
-def test_what_was_edited_by_hand_is_found(data, encoder, tmp_path):
+def test_verify_finds_manual_edits(data, encoder, tmp_path):
     # two episodes after 20 updates and after 40, then one under no corruption
     settings = {"eval_length": 4, "eval_episodes": 2, "eval_clean_episodes": 1}
     results = tmp_path / "results"
     add_results([finetune(smoke_finetune(encoder, data, tmp_path / "run", **settings)).path], results)
     assert verify_results(results)[1] == []
     whole = {path: path.read_text() for path in results.glob("*.*")}
-    for row, cells, said in EDITED_ROWS:
+    for row, cells, expected in EDITED_ROWS:
         edited(results, row, **cells)
-        told = verify_results(results)[1]
-        assert [one for one in told if one.endswith(f": {said}")], (cells, told)
+        found = verify_results(results)[1]
+        assert [one for one in found if one.endswith(f": {expected}")], (cells, found)
         (results / "episodes.csv").write_text(whole[results / "episodes.csv"])
-    for place, value, said in EDITED_RECORDS:
+    for place, value, expected in EDITED_RECORDS:
 
-        def edit(told: dict[str, Any], place: tuple[str, ...] = place, value: Any = value) -> None:
+        def edit(line: dict[str, Any], place: tuple[str, ...] = place, value: Any = value) -> None:
             for name in place[:-1]:
-                told = told[name]
-            assert told[place[-1]] != value
-            told[place[-1]] = value
+                line = line[name]
+            assert line[place[-1]] != value
+            line[place[-1]] = value
 
-        told = changed(results, edit)
-        assert [one for one in told if said in one], (place, told)
+        found = changed(results, edit)
+        assert [one for one in found if expected in one], (place, found)
         (results / "runs.jsonl").write_text(whole[results / "runs.jsonl"])
     head, first, second, *others = whole[results / "episodes.csv"].splitlines(keepends=True)
     (results / "episodes.csv").write_text("".join([head, second, first, *others]))
-    (told,) = verify_results(results)[1]  # intervals pair episodes by their place
-    assert told.endswith(f"at step 20 under {OWN} it has the episodes [1, 0], its record 2, from 0 on")
+    (found,) = verify_results(results)[1]  # intervals pair episodes by their order
+    assert found.endswith(f"at step 20 under {OWN} it has the episodes [1, 0], its record 2, from 0 on")
     (results / "episodes.csv").write_text(head)
-    told = changed(results, lambda told: told.update(episodes=0))
-    assert len(told) == 3, "two evaluations and an uncorrupted one"
+    found = changed(results, lambda line: line.update(episodes=0))
+    assert len(found) == 3, "two evaluations and an uncorrupted one"
 
 
-def test_what_may_change_is_recorded_as_it_was_when_the_run_ended(data, encoder, tmp_path, monkeypatch):
+def test_changeable_settings_are_recorded_as_of_the_end(data, encoder, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         cut_at(patch, 2)
         with pytest.raises(CutError):
             finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4))
     run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4, eval_clean=False, log_every=5)).path
     add_results([run], tmp_path / "results")
-    (told,) = read_results(tmp_path / "results")
-    assert (told.record["config"]["eval_clean"], told.record["config"]["log_every"]) == (False, 5)
+    (added,) = read_results(tmp_path / "results")
+    assert (added.record["config"]["eval_clean"], added.record["config"]["log_every"]) == (False, 5)
     assert verify_results(tmp_path / "results")[1] == []
 
 
-def test_an_episode_is_replayed_to_the_digit_and_a_difference_names_what_drew_and_computed(
-    data, encoder, tmp_path, capsys
-):
+def test_verify_replays_an_episode_exactly(data, encoder, tmp_path, capsys):
     run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4)).path
     write_json(run / "render.json", read_json(run / "render.json") | {"gl_renderer": "another renderer"})
     whole_run(tmp_path / "other")
@@ -176,7 +174,7 @@ def test_an_episode_is_replayed_to_the_digit_and_a_difference_names_what_drew_an
 
 
 @pytest.mark.parametrize("critic", [{"value": "much"}, {"moved": True}, {"moved": float("nan")}, {"valu": 1.0}, [1.0]])
-def test_a_damaged_critic_is_refused_at_the_door(tmp_path, critic):
+def test_damaged_critic_is_rejected(tmp_path, critic):
     run = whole_run(tmp_path / "run")
     write_json(run / "critic.json", critic)
     with pytest.raises(UserError, match=r"critic|JSON object"):
@@ -184,10 +182,10 @@ def test_a_damaged_critic_is_refused_at_the_door(tmp_path, critic):
     assert not (tmp_path / "results").exists()
 
 
-def test_an_empty_critic_is_refused_beside_a_critics_metrics_and_counts_for_nothing_beside_a_discount(tmp_path):
+def test_empty_critic_contradicting_metrics_is_rejected(tmp_path):
     run = whole_run(tmp_path / "run")
     write_json(run / "critic.json", {})
-    assert load_runs([run])[0].converged is True, "an algorithm without one"
+    assert load_runs([run])[0].converged is True, "an algorithm without a critic"
     record = read_json(run / "config.json")
     write_json(run / "config.json", record | {"config": record["config"] | {"gamma": 0.99}})
     assert load_runs([run])[0].converged is None
