@@ -1,4 +1,4 @@
-"""Sweeps without training: a program of one's own stands in for `vd4rl-pomdp`, and does what each job's script says."""
+"""Sweeps without training: a program in place of `vd4rl-pomdp` follows each job's script."""
 
 import json
 import time
@@ -53,13 +53,13 @@ with ExitStack() as stack:
 
 
 def job(out: Path, name: str, *needs: str, ends: tuple[int | str, ...] = ()) -> Job:
-    """A job that ends as told, one end an attempt, and then well.
+    """A job with a given end for each attempt, and success after those.
 
     Args:
         out: the sweep's folder.
-        name: the job's.
-        needs: names of jobs before it.
-        ends: exit codes, "kill" (SIGKILL), "defect" (a traceback), or "wait" (well, once OUT/go is there).
+        name: of the job.
+        needs: names of jobs that must finish first.
+        ends: exit codes, "kill" (SIGKILL), "defect" (a traceback), or "wait" (success once OUT/go exists).
     """
     out.mkdir(exist_ok=True)
     (out / f"{name}.script").write_text(json.dumps(ends))
@@ -67,14 +67,14 @@ def job(out: Path, name: str, *needs: str, ends: tuple[int | str, ...] = ()) -> 
 
 
 def policy(out: Path, name: str, *needs: str, ends: tuple[int | str, ...] = (), updates: int = 40) -> Job:
-    """Likewise a fine-tuning, which may be stacked with those of as many updates."""
+    """A fine-tuning job, as `job`, which can be stacked with jobs of equal `updates`."""
     encoder = out / (needs[-1] if needs else name) / "encoder"
     words = ["finetune", "--updates", str(updates), "--encoder", str(encoder), "--out", str(out / name)]
     return replace(job(out, name, *needs, ends=ends), section="finetune", words=words)
 
 
 def keep_plan(out: Path, *jobs: Job, name: str = "plan") -> Plan:
-    """A plan of such jobs."""
+    """Store a plan of such jobs."""
     program = out / "program.py"
     if not program.exists():
         program.write_text(PROGRAM.replace("RECORD", repr(RECORD)))
@@ -82,14 +82,14 @@ def keep_plan(out: Path, *jobs: Job, name: str = "plan") -> Plan:
 
 
 def begun(job: Job) -> list[dict]:
-    """What each of a job's processes saw of its environment."""
+    """The environment that each process of a job recorded."""
     path = job.folder / "begun"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def until(holds: Callable[[], object], seconds: float = 120.0) -> None:
-    """Wait for what must become true."""
+    """Wait until `holds()` is true."""
     end = time.monotonic() + seconds
     while not holds():
-        assert time.monotonic() < end, "it did not come"
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.05)

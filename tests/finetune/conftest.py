@@ -1,4 +1,4 @@
-"""One set, one encoder and one finished run for all tests of the stage: those that change a run copy it first."""
+"""One dataset, encoder and finished run shared by all fine-tuning tests; tests that change a run copy it."""
 
 import shutil
 from pathlib import Path
@@ -12,10 +12,10 @@ BRIEF = {"updates": 2, "batch_size": 4, "eval_length": 2}
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory) -> Path:
-    """Folder that holds a set, an encoder that was pretrained on it, and a policy on that."""
+    """Folder with a dataset, an encoder pretrained on it, and a fine-tuning run."""
     from finetune.train import finetune
     from pretrain.train import pretrain
-    from tests.helpers_stages import smoke_finetune, smoke_pretrain  # not before: some tests train nothing
+    from tests.helpers_stages import smoke_finetune, smoke_pretrain  # imported late: some tests train nothing
 
     folder = tmp_path_factory.mktemp("trained")
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Updates are what the papers' formulas say, on networks small enough to write the formulas out."""
+"""Updates match the papers' formulas, on small networks."""
 
 import sys
 from dataclasses import replace
@@ -20,7 +20,7 @@ from vd4rl_pomdp.testing.algorithms import ACTIONS, DIM, SIZE, batch
 
 
 def make(kind: type, learning_rate: float = 1e-3) -> Algorithm:
-    """An algorithm whose features need to be standardised."""
+    """An algorithm whose policy standardises its features."""
     torch.manual_seed(0)
     options = kind.options.fill({"gamma": 0.9, "alpha": 1.5})
     policy = Policy(DIM, ACTIONS, 16)
@@ -28,17 +28,17 @@ def make(kind: type, learning_rate: float = 1e-3) -> Algorithm:
     return kind(policy, options, learning_rate, 40, RandomStream(torch.Generator().manual_seed(0)))
 
 
-def test_drqv2s_noise_decays_linearly_and_then_stays():
+def test_drqv2_noise_decays_linearly_to_its_minimum():
     found = [noise_at(updates, 10**6) for updates in (0, 125_000, 250_000, 10**6)]
     assert found == pytest.approx([1.0, 0.55, 0.1, 0.1])
 
 
 @pytest.mark.parametrize("kind", [BC, DrQv2BC])
-def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monkeypatch, kind):
-    """Else a clone near a bound is pushed to it: what the data's mean action is held against has the noise cut off."""
+def test_noise_schedule_ends_by_the_middle_of_short_trainings(monkeypatch, kind):
+    """Else actions near a bound are pushed to it, because clipped noise biases the cloned mean."""
     stds = []
     module = sys.modules[kind.__module__]
-    monkeypatch.setattr(module, "noise_at", lambda *told: stds.append(noise_at(*told)) or stds[-1])
+    monkeypatch.setattr(module, "noise_at", lambda *args: stds.append(noise_at(*args)) or stds[-1])
     algorithm = make(kind)  # of 40 updates
     for number in range(40):
         algorithm.update(batch(number))
@@ -48,7 +48,7 @@ def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monke
 
 
 def numbers(algorithm: IQL, given: FeatureBatch) -> dict[str, np.ndarray]:
-    """What IQL's equations are about: the values that its networks give to a batch."""
+    """The quantities of IQL's equations: outputs of its networks for a batch."""
     with torch.no_grad():
         z, next_z = algorithm.policy.standardise(given.z), algorithm.policy.standardise(given.next_z)
         found = {
@@ -64,7 +64,7 @@ def numbers(algorithm: IQL, given: FeatureBatch) -> dict[str, np.ndarray]:
 
 
 def make_iql(temperature: float = 3.0) -> tuple[IQL, FeatureBatch]:
-    """An IQL whose networks and deviations differ from their targets and from each other, and do not learn."""
+    """An IQL with zero learning rate, whose target networks and standard deviations are perturbed."""
     algorithm = make(IQL, learning_rate=0.0)
     algorithm.settings = replace(algorithm.settings, expectile=0.7, temperature=temperature)
     with torch.no_grad():
@@ -74,8 +74,8 @@ def make_iql(temperature: float = 3.0) -> tuple[IQL, FeatureBatch]:
     return algorithm, batch()
 
 
-def test_iqls_losses_are_those_of_the_papers_equations():
-    """Equations 5 (value), 6 (critics) and 7 (actor), with the smaller target value and the authors' clipped weight."""
+def test_iql_losses_match_the_papers_equations():
+    """Equations 5 (value), 6 (critics) and 7 (actor), with the minimum target value and the clipped weight."""
     algorithm, given = make_iql(temperature=8.0)
     n = numbers(algorithm, given)
     found = algorithm.update(given)
@@ -92,7 +92,7 @@ def test_iqls_losses_are_those_of_the_papers_equations():
     assert found["advantage"].item() == pytest.approx(error.mean(), rel=1e-4)
 
 
-def test_iqls_actor_follows_the_weighted_likelihood_and_no_gradient_of_the_weight():
+def test_iql_actor_gradient_ignores_the_weight():
     algorithm, given = make_iql()
     n = numbers(algorithm, given)
     algorithm.update(given)
@@ -107,7 +107,7 @@ def test_iqls_actor_follows_the_weighted_likelihood_and_no_gradient_of_the_weigh
     assert all(p.grad is None for p in algorithm.target_critic.parameters())
 
 
-def test_iqls_deviations_stay_within_the_authors_bounds():
+def test_iql_log_std_is_clipped():
     algorithm, given = make_iql()
     for given_log_std, bound in ((-9.0, -5.0), (9.0, 2.0)):
         with torch.no_grad():
@@ -116,7 +116,7 @@ def test_iqls_deviations_stay_within_the_authors_bounds():
         torch.testing.assert_close(likelihood, torch.full((SIZE,), -ACTIONS * (bound + 0.5 * np.log(2 * np.pi))))
 
 
-def test_iqls_target_critic_creeps_before_the_value_reads_it():
+def test_iql_target_critic_moves_before_the_value_update():
     """The authors' cycle is value, actor, critics, target: what follows the target's step is the value's."""
     algorithm, given = make_iql()
     algorithm.tau = 1.0
@@ -126,7 +126,7 @@ def test_iqls_target_critic_creeps_before_the_value_reads_it():
     assert algorithm.update(given)["advantage"].item() == pytest.approx(error.mean().item(), rel=1e-4)
 
 
-def test_iqls_actor_learns_ever_more_slowly():
+def test_iql_actor_has_cosine_learning_rate():
     algorithm = make(IQL)
     rates = []
     for updates in (0, 10, 20, 30, 40, 50):  # of 40
@@ -137,14 +137,14 @@ def test_iqls_actor_learns_ever_more_slowly():
     assert algorithm.critic_optimiser.param_groups[0]["lr"] == algorithm.value_optimiser.param_groups[0]["lr"] == 1e-3
 
 
-def test_policies_read_standardised_representations():
+def test_policies_standardise_representations():
     policy, given = make(BC).policy, batch()
     mean, std = given.z.mean(0), given.z.std(0, correction=0)
     torch.testing.assert_close(policy(given.z), policy.from_standardised((given.z - mean) / std), atol=1e-3, rtol=1e-3)
 
 
-def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
-    """One state, two actions: the rarer one is paid. What learns values must lean to it, BC to their mean."""
+def test_value_based_algorithms_prefer_the_better_action():
+    """One state, two actions, and only the rarer one is rewarded. BC chooses the mean action."""
     chosen = {}
     for name, build in ALGORITHMS.items():
         torch.manual_seed(0)
@@ -162,7 +162,7 @@ def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
 
 
 @pytest.mark.parametrize("name", ["td3_bc", "rebrac", "drqv2_bc", "iql", "fql", "bc"])
-def test_bf16_halves_the_digits_of_matrix_products_and_nothing_else(name):
+def test_bf16_affects_only_matrix_products(name):
     full, half = make(ALGORITHMS[name]), make(ALGORITHMS[name])
     for seed in range(4):
         exact = full.update(batch(seed))
@@ -171,12 +171,12 @@ def test_bf16_halves_the_digits_of_matrix_products_and_nothing_else(name):
         assert {value.dtype for value in rough.values()} == {torch.float32}
         for key, value in exact.items():
             torch.testing.assert_close(rough[key], value, atol=0.03, rtol=0.05)
-    assert any(not torch.equal(rough[key], exact[key]) for key in exact), "the products were rounded"
+    assert any(not torch.equal(rough[key], exact[key]) for key in exact), "products are rounded"
     assert {p.dtype for p in half.policy.parameters()} == {torch.float32}
 
 
-def test_outputs_are_differences_of_full_precision_also_in_bf16():
-    """Values of 256 and more, a bf16 number's digits, would else be even."""
+def test_critic_outputs_keep_fp32_precision_in_bf16():
+    """In bf16 values above 256 would be even numbers."""
     critic = TwinCritic(lambda: mlp(DIM + ACTIONS, 16, 1, last=ExactLinear))
     with torch.no_grad():
         critic.first[-1].bias.fill_(257.0)

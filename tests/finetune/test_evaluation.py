@@ -1,4 +1,4 @@
-"""An evaluated agent sees, remembers and is paid what an episode gives, on a scripted environment."""
+"""Evaluation episodes on a scripted environment: observations, memory, rewards and rows."""
 
 import json
 from dataclasses import replace
@@ -32,7 +32,7 @@ LENGTH, REWARDS = 5, (1.0, 0.5, 0.25, 2.0, 8.0)
 
 
 class ScriptedEnv:
-    """Random pictures by seed, whatever is done; what is clean is white."""
+    """Random images by seed, independent of actions; clean images are white."""
 
     def __init__(self, *arguments: object) -> None:
         self.seeds: list[tuple[int, int, int]] = []
@@ -62,7 +62,7 @@ class ScriptedEnv:
 
 @pytest.fixture
 def world(monkeypatch) -> list[ScriptedEnv]:
-    """Takes the place of the environments; holds those that were made."""
+    """Replaces the environments, and lists those that were made."""
     made: list[ScriptedEnv] = []
     monkeypatch.setattr(evaluation, "_environment", cache(lambda *a: (made.append(ScriptedEnv()), made[-1])[1]))
     return made
@@ -87,8 +87,8 @@ def play(folder: Path, *episodes: int, actor: Path | None = None) -> list[evalua
     return evaluate([replace(job, episode=episode, actor=actor) for episode in episodes], workers=1)
 
 
-def test_actions_are_the_policys_on_what_was_seen_and_done_in_the_episode(world, agent, tmp_path):
-    """Streamed in evaluation, they are those of the whole window as training would encode it."""
+def test_evaluation_actions_match_window_encoding(world, agent, tmp_path):
+    """Streamed encoding equals training's encoding of the whole window."""
     play(tmp_path, 0, 1)
     encoder, policy = agent
     for seen, done in zip(world[0].seen, world[0].done, strict=True):
@@ -103,10 +103,10 @@ def test_actions_are_the_policys_on_what_was_seen_and_done_in_the_episode(world,
         )
         with torch.no_grad():
             torch.testing.assert_close(policy(encoder.encode(window)), action, atol=1e-5, rtol=1e-4)
-    assert np.abs(np.diff(world[0].done, axis=1)).max() > 1e-3, "the policy reads something"
+    assert np.abs(np.diff(world[0].done, axis=1)).max() > 1e-3, "actions depend on the observations"
 
 
-def test_a_policy_that_was_written_anew_is_the_one_that_plays(world, agent, tmp_path):
+def test_evaluation_reloads_a_changed_policy(world, agent, tmp_path):
     play(tmp_path, 0)
     torch.manual_seed(1)
     Policy(8, 6, 8).save(tmp_path / "policy")
@@ -117,40 +117,40 @@ def test_a_policy_that_was_written_anew_is_the_one_that_plays(world, agent, tmp_
         play(tmp_path, 0)
 
 
-def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path):
+def test_episodes_are_independent(world, agent, tmp_path):
     play(tmp_path, 0, 1)
     evaluation._environment.cache_clear()
     play(tmp_path, 1)
     np.testing.assert_array_equal(world[0].done[1], world[1].done[0])
 
 
-def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(world, agent, tmp_path):
+def test_episode_seeds_are_fixed(world, agent, tmp_path):
     play(tmp_path, 0, 3)
     assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
     labels = {"method": "x", "task": "walker_walk"}
     assert [row["episode_seed"] for row in episode_rows(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
 
 
-def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
+def test_return_is_the_sum_of_rewards_and_score_a_tenth(world, agent, tmp_path):
     (episode,) = play(tmp_path, 0)
     assert (episode.total, len(episode.rewards)) == (sum(REWARDS), LENGTH)
     (row,) = episode_rows([episode], {"task": "walker_walk"})
     assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
 
 
-def test_the_action_error_is_to_what_the_datas_actor_does_where_the_policy_is(world, agent, tmp_path):
+def test_action_error_compares_with_actor_at_visited_states(world, agent, tmp_path):
     (without,) = play(tmp_path, 0)
     assert without.action_error is None
     (episode,) = play(tmp_path, 0, actor=ASSETS / "walker_walk_expert.safetensors")
     expert = load_actor("walker_walk", "expert")
     shown = [expert.act(np.full(24, t / 10, np.float32)) for t in range(LENGTH)]
     assert episode.action_error == pytest.approx(np.square(np.array(world[0].done[-1]) - shown).mean())
-    assert np.abs(np.diff(shown, axis=0)).max() > 0.1, "the states tell the rows apart"
+    assert np.abs(np.diff(shown, axis=0)).max() > 0.1, "states differ between rows"
     (row,) = episode_rows([episode], {"task": "walker_walk"})
     assert (row["evaluated_under"], row["action_error"]) == ("patch", round(episode.action_error, 6))
 
 
-def test_parts_of_episodes_tell_where_reward_and_errors_are():
+def test_reward_and_error_by_part_of_episode():
     whole = Episode("none", 0, [0.0, 1.0, 2.0, 3.0, 4.0], None, [0.1, 0.2, 0.3, 0.4, 0.5])
     short = Episode("none", 1, [6.0], None, [0.5])
     assert by_part([whole, short], 2) == {
@@ -161,30 +161,28 @@ def test_parts_of_episodes_tell_where_reward_and_errors_are():
     assert by_part([Episode("none", 0, [1.0], None)], 1) == {"0-0": {"reward": 1.0, "action_error": None}}
 
 
-def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(world, run, data, tmp_path, capsys):
+def test_evaluate_uses_training_corruption_and_none_by_default(world, run, data, tmp_path, capsys):
     for asked, expected in ((None, ["patch+zero_frames", "none"]), ("patch", ["patch"])):
         rows, _ = evaluate_run(run, asked, 1, 1)
         assert [row["evaluated_under"] for row in rows] == expected
-        assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
+        assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "the training corruption"
     rest = ["--parts", "2", "--out", str(tmp_path / "rows.csv")]
     main(["evaluate", str(run), "--episodes", "1", "--workers", "1", *rest])
-    told = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
-    assert told["data_return"] == f"{open_dataset(data).returns.mean():.6g}"
-    assert (told["path_error"], told["under.none.action_error"]) == ("unknown", "unknown")
-    halves = [float(told[f"under.none.parts.{part}.reward"]) for part in ("0-1", "2-4")]
+    shown = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert shown["data_return"] == f"{open_dataset(data).returns.mean():.6g}"
+    assert (shown["path_error"], shown["under.none.action_error"]) == ("unknown", "unknown")
+    halves = [float(shown[f"under.none.parts.{part}.reward"]) for part in ("0-1", "2-4")]
     assert halves == pytest.approx([np.mean(REWARDS[:2]), np.mean(REWARDS[2:])], rel=1e-5)
     written = read_episodes(tmp_path / "rows.csv")
     for row in written:
-        assert told[f"under.{row['evaluated_under']}.return_mean"] == f"{row['return']:.6g}"
-        assert told[f"under.{row['evaluated_under']}.share_above_80"] == "0"
+        assert shown[f"under.{row['evaluated_under']}.return_mean"] == f"{row['return']:.6g}"
+        assert shown[f"under.{row['evaluated_under']}.share_above_80"] == "0"
     main(["evaluate", str(run), "--episodes", "1", "--workers", "1", "--corruption", "none", "--json"])
     (only,) = json.loads(capsys.readouterr().out)["under"].items()
     assert (only[0], only[1]["episodes"]) == ("none", written[1:])
 
 
-def test_options_of_a_corruption_are_flags_and_its_rows_tell_of_those_that_are_not_the_runs_own(
-    world, run, tmp_path, capsys, monkeypatch
-):
+def test_evaluate_accepts_corruption_options(world, run, tmp_path, capsys, monkeypatch):
     """The run was trained under patch+zero_frames, patches of 16 pixels."""
     jobs, play_all = [], evaluation.evaluate
     monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or play_all(given, workers))
@@ -202,9 +200,9 @@ def test_options_of_a_corruption_are_flags_and_its_rows_tell_of_those_that_are_n
         main(["evaluate", str(run), "--corruption", *words.split(), *rest])
     rows = read_episodes(tmp_path / "rows.csv")
     assert [row["evaluated_under"] for row in rows] == list(played.values())
-    assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
+    assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "the training corruption"
     assert (jobs[1].corruption.stages[0].patch_size, jobs[5].corruption.stages[0].kept) == (24, "oldest")
-    for words, told in (
+    for words, message in (
         ("patch --kept oldest", "Unrecognized options: --kept"),
         ("patch --patch-size 85", "patch size 85 exceeds the image"),
         ("patch --patch-size 0", "--patch-size is 0"),
@@ -214,13 +212,13 @@ def test_options_of_a_corruption_are_flags_and_its_rows_tell_of_those_that_are_n
         with pytest.raises(SystemExit) as end:
             main(["evaluate", str(run), "--corruption", *words.split()])
         assert end.value.code == 2
-        assert told in (error := capsys.readouterr().err)
+        assert message in (error := capsys.readouterr().err)
         assert error.count("\n") == 1
     with pytest.raises(UserError, match="--patch-sise is not read by the corruption patch"):
         evaluate_run(run, "patch", 1, 1, patch_sise=3)
 
 
-def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, run, tmp_path, capsys, monkeypatch):
+def test_keep_stores_rows_under_another_corruption_once(world, run, tmp_path, capsys, monkeypatch):
     before = read_episodes(run / "episodes.csv")
     words = ["evaluate", str(run), "--episodes", "2", "--workers", "1", "--keep"]
     for option in ([], ["--patch-size", "24"]):
@@ -228,20 +226,20 @@ def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, r
     rows = read_episodes(run / "episodes.csv")
     assert rows[: len(before)] == before
     assert [row["evaluated_under"] for row in rows[len(before) :]] == ["patch"] * 2 + ["patch, patch_size 24"] * 2
-    for wrong, told in (
+    for wrong, message in (
         (["--corruption", "patch"], "episodes.csv already has 2 episodes under patch; leave --keep out"),
         ([], "--keep needs --corruption"),
     ):
         with pytest.raises(SystemExit) as end:
             main([*words, *wrong])
         assert end.value.code == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     found = tables.elsewhere(episodes_frame(load_runs([run])))
     assert found["evaluated_under"].tolist() == ["patch", "patch, patch_size 24"]
     assert found["score"].tolist() == pytest.approx([1.175, 1.175])
     play_all = evaluation.evaluate
 
-    def meanwhile(*jobs):  # another process keeps the same
+    def meanwhile(*jobs):  # another process stores rows of the same corruption
         append_episodes(run / "episodes.csv", [rows[-1] | {"evaluated_under": "truncate"}])
         return play_all(*jobs)
 
@@ -254,7 +252,7 @@ def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, r
         evaluation.refuse_kept(run, "truncate")
 
 
-def test_another_corruption_is_played_with_the_runs_own_options_over_its_own_length(world, run, monkeypatch):
+def test_other_corruption_inherits_options_and_length_of_the_run(world, run, monkeypatch):
     card = read_json(run / "encoder" / "config.json")
     card["pretrain"]["corruption"] |= {"patch_size": 40, "corruption_mode": "emission"}
     write_json(run / "encoder" / "config.json", card)
@@ -265,13 +263,13 @@ def test_another_corruption_is_played_with_the_runs_own_options_over_its_own_len
     assert [job.length for job in jobs] == [2]
 
 
-def test_an_evaluation_is_of_the_step_of_the_policy_and_not_of_the_newest_row(world, run):
-    """A run that was cut in its evaluation has a policy and no row of it yet."""
+def test_evaluation_step_is_that_of_the_policy(world, run):
+    """A run cut in its evaluation has a policy without rows."""
     load_policy(run / "policy").save(run / "policy", step=7)
     assert [row["step"] for row in evaluate_run(run, None, 1, 1)[0]] == [7, 7]
 
 
-def test_slips_are_one_line_and_touch_no_file(world, run, encoder, tmp_path):
+def test_invalid_evaluations_change_no_file(world, run, encoder, tmp_path):
     with pytest.raises(UserError, match="unknown corruption 'fog'"):
         evaluate_run(run, "fog", 1, 1)
     with pytest.raises(UserError, match="holds no evaluated run"):

@@ -1,4 +1,4 @@
-"""Cached features keep their rows: every feature here tells the view and the row it is of."""
+"""Cached features stay aligned with their rows and views."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-def test_every_field_of_a_batch_is_of_one_transition_and_both_ends_of_one_view(tmp_path):
+def test_feature_batches_are_aligned(tmp_path):
     dataset = open_dataset(write_fake_set(tmp_path / "set", LENGTHS))
     features = torch.stack(torch.meshgrid(torch.arange(VIEWS), torch.arange(len(ROWS)), indexing="ij"), -1)
     histories = Histories(dataset, NO_OPTIONS, N, 0)
@@ -42,7 +42,7 @@ def test_every_field_of_a_batch_is_of_one_transition_and_both_ends_of_one_view(t
 
 
 def noise_set(folder, first_action: float = 0.0, lengths: tuple[int, ...] = LENGTHS) -> Dataset:
-    """Episodes of random pixels; the first row of each stores an action that nobody took."""
+    """Episodes of random pixels; their first rows store `first_action`, which was never taken."""
     rows = fake_rows(lengths)
     rows["observation"] = np.random.default_rng(0).integers(1, 256, rows["observation"].shape, dtype=np.uint8)
     rows["action"][rows["step_type"] == 0] = first_action
@@ -55,8 +55,8 @@ def frozen(
     dataset: Dataset, corruption: CorruptionConfig, shift: int, seed: int = 0, **settings: object
 ) -> FrozenEncoder:
     torch.manual_seed(0)
-    told = {"history": "gru", "use_actions": True, "hidden_dim": 8} | settings
-    encoder = Encoder(EncoderConfig(6, "nature", 16, **told)).eval().requires_grad_(False)
+    settings = {"history": "gru", "use_actions": True, "hidden_dim": 8} | settings
+    encoder = Encoder(EncoderConfig(6, "nature", 16, **settings)).eval().requires_grad_(False)
     return FrozenEncoder(encoder.to(dataset.t.device), dataset, corruption, shift, "fp32", seed)
 
 
@@ -74,14 +74,14 @@ def views_of(tmp_path, corruption: str, mode: str, shift: int) -> torch.Tensor:
         ("none", "resample", 0, False),
     ],
 )
-def test_views_are_draws_of_their_own_of_shift_and_of_resampled_corruption(tmp_path, corruption, mode, shift, differ):
+def test_views_differ_by_shift_and_resampled_corruption(tmp_path, corruption, mode, shift, differ):
     first, second = views_of(tmp_path, corruption, mode, shift)
     assert first.shape == (len(ROWS), 8)
     for start in (0, LENGTHS[0]):
         assert torch.equal(first[start:], second[start:]) != differ
 
 
-def test_an_episodes_first_row_carries_no_action(tmp_path):
+def test_first_row_has_no_previous_action(tmp_path):
     plain, odd = (
         frozen(noise_set(tmp_path / name, action), CorruptionConfig(), 0)
         for name, action in (("plain", 0.0), ("odd", 0.9))
@@ -91,8 +91,8 @@ def test_an_episodes_first_row_carries_no_action(tmp_path):
         torch.testing.assert_close(one, other)
 
 
-def test_exact_batches_agree_with_cached_features(encoder, data):
-    """Without corruption and shift both modes must give the same representation for the same row."""
+def test_exact_batches_equal_cached_features(encoder, data):
+    """Without corruption and shift both modes give the same representation of a row."""
     dataset = open_dataset(data)
     network, _ = load_encoder(encoder)
     frozen = FrozenEncoder(network, dataset, CorruptionConfig(), 0, "fp32", 0)
@@ -104,9 +104,9 @@ def test_exact_batches_agree_with_cached_features(encoder, data):
     torch.testing.assert_close(batch.z, cached[rows], atol=1e-5, rtol=1e-4)
     next_rows = torch.minimum(rows + 3, dataset.episode_end[dataset.episode[rows]] - 1)
     torch.testing.assert_close(batch.next_z, cached[next_rows], atol=1e-5, rtol=1e-4)
-    told = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), cached[None], 16, 3, 0.99, sampler.draws).data[index]
+    stored = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), cached[None], 16, 3, 0.99, sampler.draws).data[index]
     expected = torch.cat([batch.action, batch.next_action, batch.reward[:, None], batch.discount[:, None]], 1)
-    assert torch.equal(told, expected)
+    assert torch.equal(stored, expected)
 
 
 MEMORIES = {"none": {"history": "none"}, "whole": {}, "window": {"history_window": 3}}
@@ -115,8 +115,8 @@ OPTIONS = HistoryOptions(random_histories=0.5, shortest_history=1, longest_histo
 
 @pytest.mark.parametrize("memory", MEMORIES)
 @pytest.mark.parametrize(("chunk", "group"), [(3, 10), (100, 100)])
-def test_episodes_that_are_encoded_together_are_as_one_by_one(tmp_path, memory, chunk, group):
-    """As on a GPU: rows of several episodes in one batch, and memories that read episodes of uneven length at once."""
+def test_grouped_encoding_equals_single_episodes(tmp_path, memory, chunk, group):
+    """A GPU encodes rows of several episodes in one batch, with memories over episodes of unequal length."""
     dataset, found = noise_set(tmp_path / "set", 0.9, (6, 4, 1, 5, 9)), []
     for together in (False, True):
         made = frozen(dataset, CorruptionConfig.of("patch+zero_frames"), 4, **MEMORIES[memory])
@@ -129,13 +129,13 @@ def test_episodes_that_are_encoded_together_are_as_one_by_one(tmp_path, memory, 
     assert found[0].float().std(1).mean() > 2e-2, "rows differ"
 
 
-def test_a_process_encodes_once_for_all_trainings_that_see_the_same(tmp_path):
+def test_features_are_shared_within_a_process(tmp_path):
     dataset, patch = noise_set(tmp_path / "set"), CorruptionConfig.of("patch")
     whole, random = (Histories(dataset, options, N, 0) for options in (NO_OPTIONS, OPTIONS))
     kept = iter(tmp_path / f"{number}.npy" for number in range(99))
     first = encode_views(frozen(dataset, patch, 4), whole, 2, next(kept), "name")
     assert encode_views(frozen(dataset, patch, 4), whole, 2, tmp_path / "no.npy", "name") is first
-    assert not (tmp_path / "no.npy").exists(), "one file is enough to resume from"
+    assert not (tmp_path / "no.npy").exists(), "features are stored once"
     unread = Histories(dataset, NO_OPTIONS, 3, 1)
     assert encode_views(frozen(dataset, patch, 4), unread, 2, tmp_path / "no", "name") is first
     others = [
@@ -158,7 +158,7 @@ def test_a_process_encodes_once_for_all_trainings_that_see_the_same(tmp_path):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("memory", MEMORIES)
-def test_a_gpu_encodes_what_a_cpu_does(tmp_path, memory):
+def test_gpu_features_match_cpu_features(tmp_path, memory):
     options = NO_OPTIONS if memory == "none" else OPTIONS
     noise_set(tmp_path / "set", 0.9, (60, 40, 1, 50, 90) * 20)
     found = {}

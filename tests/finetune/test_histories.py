@@ -1,4 +1,4 @@
-"""Where histories begin: against encoding one transition after the other, from exactly the rows it may see."""
+"""Random histories, compared with encoding each transition from exactly its visible rows."""
 
 import json
 
@@ -25,8 +25,8 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 @pytest.fixture(params=[("gru", {}), ("transformer", {"attention_window": 3}), ("lru", {})], ids=lambda kind: kind[0])
 def frozen(tmp_path, request) -> FrozenEncoder:
     torch.manual_seed(0)
-    history, told = request.param
-    config = EncoderConfig(6, "nature", 16, history, use_actions=True, hidden_dim=8, memory_options=told)
+    history, options = request.param
+    config = EncoderConfig(6, "nature", 16, history, use_actions=True, hidden_dim=8, memory_options=options)
     encoder = Encoder(config).eval()
     return FrozenEncoder(
         encoder.requires_grad_(False), noise_set(tmp_path / "set", 0.9), CorruptionConfig(), 0, "fp32", 0
@@ -34,7 +34,7 @@ def frozen(tmp_path, request) -> FrozenEncoder:
 
 
 def ends_of(frozen: FrozenEncoder, first: int, row: int, last: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Both ends of a transition, from a stream that begins at row `first` and knows no earlier action."""
+    """Both ends of a transition, encoded step by step from row `first` without an earlier action."""
     state, action, read = frozen.encoder.initial_state(1), torch.zeros(1, 6), []
     for now in range(first, last + 1):
         z, state = frozen.encoder.step(View(frozen.dataset).stacks(torch.tensor([now])), action, state)
@@ -44,7 +44,7 @@ def ends_of(frozen: FrozenEncoder, first: int, row: int, last: int) -> tuple[tor
 
 
 @pytest.mark.parametrize(("share", "shortest", "longest"), [(0.0, 2, 8), (0.5, 1, 3), (1.0, 2, 2), (1.0, 9, 9)])
-def test_both_ends_of_every_transition_share_a_history_of_the_drawn_rows(frozen, tmp_path, share, shortest, longest):
+def test_both_ends_of_a_transition_share_a_history(frozen, tmp_path, share, shortest, longest):
     options = HistoryOptions(random_histories=share, shortest_history=shortest, longest_history=longest)
     histories = Histories(frozen.dataset, options, N, 0)
     features = encode_views(frozen, histories, 2, tmp_path / "features.npy", "name").float()
@@ -63,14 +63,14 @@ def test_both_ends_of_every_transition_share_a_history_of_the_drawn_rows(frozen,
             torch.testing.assert_close(features[view, last_end], expected[1], atol=2e-3, rtol=0)
 
 
-def test_views_draw_their_random_histories_apart_and_the_same_again(frozen):
+def test_random_histories_differ_between_views_and_repeat(frozen):
     histories = Histories(frozen.dataset, HistoryOptions(random_histories=0.5), N, 0)
     assert torch.equal(histories.of_view(0).chosen, histories.of_view(0).chosen)
     draws = [torch.cat([(view := histories.of_view(n)).chosen, view.length]).tolist() for n in range(4)]
     assert len({tuple(draw) for draw in draws}) > 1
 
 
-def test_batches_are_of_the_drawn_histories(frozen, tmp_path):
+def test_batches_use_drawn_histories(frozen, tmp_path):
     histories = Histories(frozen.dataset, HistoryOptions(random_histories=1.0, longest_history=2), N, 0)
     features = encode_views(frozen, histories, 1, tmp_path / "features.npy", "name")
     sampler = FeatureSampler(histories, features, 64, N, 0.99, RandomStream(torch.Generator().manual_seed(0)))
@@ -79,10 +79,10 @@ def test_batches_are_of_the_drawn_histories(frozen, tmp_path):
     index = torch.randint(len(first), (64,), generator=torch.Generator().manual_seed(0))
     assert torch.equal(batch.z, known[first[index]])
     assert torch.equal(batch.next_z, known[last[index]])
-    assert first.min() >= len(ROWS), "none is a whole history"
+    assert first.min() >= len(ROWS), "all histories are random ones"
 
 
-def test_exact_batches_begin_at_random_rows_too(frozen):
+def test_exact_batches_use_random_histories(frozen):
     options = HistoryOptions(random_histories=1.0, shortest_history=1, longest_history=1)
     batch = ExactSampler(frozen, options, 16, N, 0.99, RandomStream(torch.Generator().manual_seed(0))).sample()
     index = torch.randint(len(ROWS) - 2, (16,), generator=torch.Generator().manual_seed(0))
@@ -94,18 +94,18 @@ def test_exact_batches_begin_at_random_rows_too(frozen):
         torch.testing.assert_close(next_z, expected[1], atol=1e-5, rtol=1e-4)
 
 
-def test_a_run_keeps_what_its_policy_reads_and_evaluates_with_it(encoder, data, tmp_path):
-    told = {"readout": "frame+state", "history_window": 4, "random_histories": 0.5, "longest_history": 3}
-    config = smoke_finetune(encoder, data, tmp_path / "run", **told, **BRIEF)
+def test_run_stores_readout_and_history_options(encoder, data, tmp_path):
+    options = {"readout": "frame+state", "history_window": 4, "random_histories": 0.5, "longest_history": 3}
+    config = smoke_finetune(encoder, data, tmp_path / "run", **options, **BRIEF)
     run = finetune(config)
     kept, _ = load_encoder(run.path / "encoder")
     assert (kept.config.readout, kept.config.history_window) == ("frame+state", 4)
     assert json.loads((run.path / "policy" / "config.json").read_text())["dim"] == kept.dim == 64
     record = json.loads((run.path / "config.json").read_text())["config"]
-    assert {name: record[name] for name in told} == told
+    assert {name: record[name] for name in options} == options
     assert finetune(config).finished
 
 
-def test_the_shortest_history_is_not_longer_than_the_longest():
+def test_shortest_history_must_not_exceed_longest():
     with pytest.raises(UserError, match="--shortest-history is 5, --longest-history 4: choose"):
         FinetuneConfig.of("smoke", shortest_history=5, longest_history=4).check()

@@ -1,4 +1,4 @@
-"""The path error is that of the policy's action to the actor's mean action at the same row."""
+"""The path error compares the policy's action with the actor's mean action at the same row."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ ROWS = 12
 
 @pytest.fixture
 def walked(tmp_path):
-    """Two episodes of the expert, whose frames and actions are others'."""
+    """Two episodes with the expert's physics; frames and actions are fake."""
     env, actor = make_env(TASKS["walker_walk"], size=None, length=ROWS - 1), load_actor("walker_walk", "expert")
     steps, rng = [], np.random.default_rng(0)
     for seed in range(2):
@@ -39,12 +39,12 @@ def walked(tmp_path):
     return folder, np.stack([step.state for step in steps]), actor
 
 
-def test_simulator_states_are_observed_as_in_the_environment(walked):
+def test_observed_states_match_the_environment(walked):
     folder, states, _ = walked
     np.testing.assert_allclose(observed_states(TASKS["walker_walk"], open_dataset(folder).physics), states, atol=1e-6)
 
 
-def test_the_path_error_is_to_the_actors_mean_action_at_the_same_row(walked):
+def test_path_error_compares_with_actor_at_the_same_row(walked):
     folder, states, actor = walked
     shown = torch.from_numpy(np.stack([actor.act(state) for state in states]))
     path = open_dataset(folder), actor, lambda number: shown[number * ROWS : (number + 1) * ROWS]
@@ -53,7 +53,7 @@ def test_the_path_error_is_to_the_actors_mean_action_at_the_same_row(walked):
     assert path_error(*path, lambda z: z.roll(1, 0)) > 0.01, "the rows differ"
 
 
-def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
+def test_path_error_ignores_episodes_of_one_row(walked, monkeypatch):
     folder, states, actor = walked
     dataset = open_dataset(folder)
     ends = torch.tensor([ROWS, ROWS + 1, 2 * ROWS])
@@ -65,7 +65,7 @@ def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
 
 
 @pytest.mark.parametrize("views", [1, 0])
-def test_a_run_keeps_its_path_error_and_compares_closed_loop_actions(walked, encoder, tmp_path, monkeypatch, views):
+def test_run_stores_path_error_and_action_errors(walked, encoder, tmp_path, monkeypatch, views):
     monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
     folder, _, actor = walked
     config = smoke_finetune(encoder, folder, tmp_path / "run", views=views, **BRIEF)

@@ -1,4 +1,4 @@
-"""Runs that are trained as one are what they are alone: folders, records and states, and numbers up to rounding."""
+"""Runs trained as a stack equal single runs: folders, records and states, and numbers up to rounding."""
 
 import csv
 import os
@@ -41,19 +41,19 @@ BRIEF = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "log_every": 3, 
 
 
 def same_but_for_rounding(one: Path, other: Path) -> None:
-    """Two folders of one run: the same files, records and rows, and numbers close to one another."""
+    """Assert that two folders hold the same files, records and rows, with close numbers."""
     names = [sorted(p.relative_to(run).as_posix() for p in run.rglob("*") if p.is_file()) for run in (one, other)]
     assert names[0] == names[1]
     records = [read_json(run / "config.json") for run in (one, other)]
-    for told in records:
-        told["config"].pop("out")
-        told.pop("command")
+    for run_record in records:
+        run_record["config"].pop("out")
+        run_record.pop("command")
     assert records[0] == records[1]
     for name in ("labels.json", "reference.json", "probe.json", "render.json"):
         if (one / name).exists() and name != "reference.json":
             assert (one / name).read_bytes() == (other / name).read_bytes()
     critics = [read_json(run / "critic.json") for run in (one, other)]
-    assert [told.pop("moved", None) for told in critics] == [None, None], "too few rows"
+    assert [critic.pop("moved", None) for critic in critics] == [None, None], "too few rows"
     assert critics[0] == pytest.approx(critics[1], rel=1e-3, abs=1e-4)
     rows = [list(csv.DictReader((run / "episodes.csv").open())) for run in (one, other)]
     for row, theirs in zip(*rows, strict=True):
@@ -70,7 +70,7 @@ def same_but_for_rounding(one: Path, other: Path) -> None:
 
 
 def close(one, other) -> None:
-    """Nested states of the same form, whose floats are close and whose other values are equal."""
+    """Assert that nested states have the same structure, close floats, and otherwise equal values."""
     assert type(one) is type(other)
     if isinstance(one, dict):
         assert list(one) == list(other)
@@ -85,7 +85,7 @@ def close(one, other) -> None:
 
 
 @pytest.mark.parametrize("algorithm", ["td3_bc", "iql"])
-def test_seeds_are_folders_of_single_runs(encoder, data, tmp_path, monkeypatch, algorithm):
+def test_seeds_option_writes_folders_equal_to_single_runs(encoder, data, tmp_path, monkeypatch, algorithm):
     words = ["finetune", "--preset", "smoke", "--encoder", str(encoder), "--data", str(data), "--algorithm", algorithm]
     words += ["--updates", "12", "--eval-every", "6", "--batch-size", "4", "--eval-length", "2", "--workers", "1"]
     for call in (["--seeds", "0,3", "--out", str(tmp_path / "s")], ["--seed", "3", "--out", str(tmp_path / "alone")]):
@@ -101,8 +101,8 @@ def test_seeds_are_folders_of_single_runs(encoder, data, tmp_path, monkeypatch, 
     assert weights[0] != weights[1]
 
 
-def test_a_batch_of_a_stack_holds_each_runs_own(tmp_path):
-    """Of sets of several lengths, and of one set's features that all share."""
+def test_stacked_batches_equal_single_batches(tmp_path):
+    """With datasets of different lengths, and with features that all members share."""
     sets = [open_dataset(write_fake_set(tmp_path / name, lengths)) for name, lengths in (("a", (6, 4)), ("b", (9,)))]
     own = [(data, torch.randn(3, data.num_rows, 5).half()) for data in (sets[0], sets[1], sets[0])]
     for chosen in (own, [own[0]] * 3):
@@ -116,7 +116,7 @@ def test_a_batch_of_a_stack_holds_each_runs_own(tmp_path):
             ]
             for _ in range(2)
         )  # fmt: skip
-        members[1].sample(), alone[1].sample()  # they need not begin at one place
+        members[1].sample(), alone[1].sample()  # members may be at different positions
         sampler = StackedSampler(members)
         for _ in range(3):
             batch = sampler.sample()
@@ -125,13 +125,13 @@ def test_a_batch_of_a_stack_holds_each_runs_own(tmp_path):
                 assert all(torch.equal(batch[name][number], expected[name]) for name in expected)
 
 
-def test_members_go_on_alone_or_in_another_stack(encoder, data, tmp_path, monkeypatch):
-    """Cut at its second checkpoint, a stack's members stand where single runs would; one is then ahead of the other."""
+def test_stacked_runs_resume_alone_or_in_another_stack(encoder, data, tmp_path, monkeypatch):
+    """A stack is cut at its second checkpoint; then one member continues alone, and the stack resumes."""
     configs = {name: smoke_finetune(encoder, data, tmp_path / name, **BRIEF, seed=seed) for name, seed in SEEDS.items()}
     for config in list(configs.values())[3:]:
         finetune(config)
     with monkeypatch.context() as patch:
-        cut_at(patch, 4)  # the first of three writes its second one, the others do not
+        cut_at(patch, 4)  # after the first member's second checkpoint
         with pytest.raises(CutError):
             finetune_all([configs["a"], configs["b"], configs["c"]])
     steps = {name: {int(p.stem) for p in (tmp_path / name / "checkpoints").glob("*.pt")} for name in ("a", "b", "c")}
@@ -139,7 +139,7 @@ def test_members_go_on_alone_or_in_another_stack(encoder, data, tmp_path, monkey
     with monkeypatch.context() as patch:
         cut_at(patch, 2)
         with pytest.raises(CutError):
-            finetune(configs["a"])  # alone; it gets as far as step 6, which is evaluated
+            finetune(configs["a"])  # alone, up to the evaluation at step 6
     made = []
     with monkeypatch.context() as patch:
         call = train.Updates.__call__
@@ -149,15 +149,15 @@ def test_members_go_on_alone_or_in_another_stack(encoder, data, tmp_path, monkey
             lambda self, done: (made.append((len(self._samplers), done)), call(self, done))[1],
         )
         finetune_all([configs["c"], configs["a"], configs["b"]])
-    assert made == [(2, 4), (2, 5), *((3, done) for done in range(6, 12))], "those behind go first"
+    assert made == [(2, 4), (2, 5), *((3, done) for done in range(6, 12))], "members that are behind catch up first"
     for name in ("a", "b", "c"):
         same_but_for_rounding(tmp_path / name, tmp_path / f"{name} alone")
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")}
     finetune_all([configs["c"], configs["a"]])
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")} == before, "what is finished stays"
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")} == before, "finished runs are not changed"
 
 
-def test_a_signal_ends_all_runs_after_one_step(encoder, data, tmp_path, monkeypatch):
+def test_sigterm_saves_all_stacked_runs_after_the_step(encoder, data, tmp_path, monkeypatch):
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(2)]
     call = train.Updates.__call__
 
@@ -177,8 +177,8 @@ def test_a_signal_ends_all_runs_after_one_step(encoder, data, tmp_path, monkeypa
 SEEDS = {"a": 0, "b": 1, "c": 2, "a alone": 0, "b alone": 1, "c alone": 2}
 
 
-def test_methods_of_one_width_stack(encoders, data, tmp_path):
-    """With and without a memory, which is given to the policy in its own way, and with seeds and views of their own."""
+def test_methods_of_equal_width_are_stacked(encoders, data, tmp_path):
+    """With and without a memory, and with different seeds and views."""
     given = {"mik+a": {"seed": 1, "view_seed": 7}, "acro": {"seed": 2, "shift": 2, "eval_episodes": 2}}
     for folder in ("stacked", "alone"):
         configs = [
@@ -191,7 +191,7 @@ def test_methods_of_one_width_stack(encoders, data, tmp_path):
         same_but_for_rounding(tmp_path / "stacked" / method, tmp_path / "alone" / method)
 
 
-def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_path, capsys, monkeypatch):
+def test_diverged_run_does_not_stop_its_stack(encoder, data, tmp_path, capsys, monkeypatch):
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(3)]
     build = FinetuneTrainer.build
 
@@ -212,7 +212,7 @@ def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "told"),
+    ("first", "second", "message"),
     [
         ("", "--batch-size 8", "cannot be stacked: --batch-size is 4 and 8"),
         ("", "--algorithm iql", "cannot be stacked: --algorithm is td3_bc and iql"),
@@ -225,20 +225,20 @@ def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_pat
         ("--seeds 0,1 --seed 3", "", "--seed and --seeds are both given"),
     ],
 )
-def test_what_does_not_stack_is_one_line_and_nothing_is_begun(encoders, data, tmp_path, first, second, told):
+def test_incompatible_stacks_are_rejected(encoders, data, tmp_path, first, second, message):
     out = tmp_path / "out"
     given = f"--preset smoke --data {data} --encoder {encoders['mik+a']} --batch-size 4 --updates 12 --eval-every 6"
     words = f"finetune {given} --out {out}/a {first} + {given} --out {out}/b {second}"
     end = run_to_end(words.format(out=out, **encoders).split())
     assert end.code == 2
-    assert told in end.line
+    assert message in end.line
     assert "\n" not in end.line
     assert not out.exists()
 
 
 @pytest.fixture(scope="module")
 def encoders(trained, tmp_path_factory) -> dict[str, Path]:
-    """Encoders of several kinds, by method."""
+    """Encoders by method, and a dataset with states."""
     folder = tmp_path_factory.mktemp("encoders")
     made = {"mik+a": trained / "pretrained" / "encoder", "states": folder / "walker_walk" / "expert"}
     with pytest.MonkeyPatch.context() as patch:
@@ -251,7 +251,7 @@ def encoders(trained, tmp_path_factory) -> dict[str, Path]:
 
 
 def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespace:
-    """An algorithm and its batches, as a run has them; learning rates are tensors, which a replayed step reads."""
+    """An algorithm and its sampler, as in a run; learning rates are tensors, which a replayed step reads."""
     torch.manual_seed(seed)
     dataset = open_dataset(data).to(device)
     generator = torch.Generator().manual_seed(seed)
@@ -266,7 +266,7 @@ def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespa
 
 
 def course_of(runs: list[SimpleNamespace], updates: int) -> list[dict[str, torch.Tensor]]:
-    """What each run logs and where it ends; the logs are read after the last update."""
+    """Logs and final state of each run; the logs are read after the last update."""
     step = train.Updates([run.algorithm for run in runs], [run.sampler for run in runs], runs[0].config)
     logs = [step(number) for number in range(updates)]
     found = []
@@ -279,8 +279,8 @@ def course_of(runs: list[SimpleNamespace], updates: int) -> list[dict[str, torch
 
 @pytest.mark.parametrize("runs", [1, 3])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_replayed_updates_are_those_that_are_run(data, monkeypatch, capsys, name, runs):
-    """Fresh noise and batches, the actor's delay, and schedules up to their end; every scalar is of its own update."""
+def test_replayed_updates_equal_eager_updates(data, monkeypatch, capsys, name, runs):
+    """Covers noise, batches, the delayed actor, complete schedules, and the scalars of every update."""
     monkeypatch.setattr("vd4rl_pomdp.core.streams.BLOCK", 32)
     modules = [sys.modules[kind.__module__] for kind in ALGORITHMS[name].__mro__]
     found = []
@@ -288,21 +288,19 @@ def test_replayed_updates_are_those_that_are_run(data, monkeypatch, capsys, name
         replays(monkeypatch, train, *modules, capture=capture)
         members = [made(name, data, seed) for seed in range(runs)]
         found.append(course_of(members, 60))
-    assert not capsys.readouterr().err, "it is replayed"
+    assert not capsys.readouterr().err, "capture did not fall back"
     for one, other in zip(*found, strict=True):
         assert one.keys() == other.keys()
         for key, value in one.items():
-            torch.testing.assert_close(
-                other[key], value, rtol=1e-4, atol=1e-6, msg=lambda told, key=key: f"{key}: {told}"
-            )
+            torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-6, msg=lambda m, key=key: f"{key}: {m}")
     parts = [run.algorithm.parts() for run in members]
     rates = [float((own.get("policy_optimiser") or own["optimiser"]).param_groups[0]["lr"]) for own in parts]
     assert rates == pytest.approx([0.0 if name == "iql" else 1e-3] * runs, abs=1e-9)
 
 
 @pytest.mark.parametrize("method", ["mik+a", "acro", "drq_bc", "bc"])
-def test_replayed_runs_are_those_that_are_run(encoders, data, tmp_path, monkeypatch, capsys, method):
-    """On features, on batches that are encoded anew, and where the encoder is trained along; cut and resumed, too."""
+def test_replayed_runs_equal_eager_runs(encoders, data, tmp_path, monkeypatch, capsys, method):
+    """On cached features, on exact batches, and end to end; interrupted and resumed."""
     changes = BRIEF | {"updates": 20, "eval_every": 10, "views": 0 if method == "acro" else 1}
     monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
     for folder, capture in (("run", None), ("replayed", record)):
@@ -318,7 +316,7 @@ def test_replayed_runs_are_those_that_are_run(encoders, data, tmp_path, monkeypa
 
 
 def along(name: str, data: Path, precision: str) -> SimpleNamespace:
-    """An algorithm that trains its encoder, too, on a GPU."""
+    """An algorithm that also trains its encoder, on a GPU."""
     torch.manual_seed(0)
     dataset = open_dataset(data).to("cuda")
     config = FinetuneConfig.of("smoke", algorithm=name, learning_rate=1e-3, updates=40, precision=precision)
@@ -335,7 +333,7 @@ GPU_UPDATES = 200
 
 
 def within_rounding(monkeypatch, capsys, make: Callable[[int], SimpleNamespace], runs: int) -> None:
-    """Captured updates, and those that are run, are farther from single ones by no more than rounding explains."""
+    """Captured and eager updates differ from single ones only by rounding."""
     found = {}
     for eager in ("0", "1"):
         monkeypatch.setenv("VD4RL_POMDP_EAGER", eager)
@@ -356,12 +354,12 @@ def within_rounding(monkeypatch, capsys, make: Callable[[int], SimpleNamespace],
 @pytest.mark.gpu
 @pytest.mark.parametrize("runs", [1, 3])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_on_a_gpu_captured_and_stacked_updates_are_single_ones_but_for_rounding(data, monkeypatch, capsys, name, runs):
+def test_gpu_captured_and_stacked_updates_match_single_ones(data, monkeypatch, capsys, name, runs):
     within_rounding(monkeypatch, capsys, lambda seed: made(name, data, seed, "cuda"), runs)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("name", ["drqv2_bc", "bc"])
-def test_on_a_gpu_an_encoder_is_trained_along_within_a_captured_update(data, monkeypatch, capsys, name, precision):
+def test_gpu_captured_updates_train_the_encoder(data, monkeypatch, capsys, name, precision):
     within_rounding(monkeypatch, capsys, lambda seed: along(name, data, precision), 1)

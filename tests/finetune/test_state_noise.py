@@ -1,4 +1,4 @@
-"""States with noise of a probe's size: as large as asked, drawn like a corruption, none where none was asked for."""
+"""State observations with noise of a probe's error: its size, and its keyed draws."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +31,7 @@ ROWS, POSE, VELOCITY = 400, 25.0, 40.0
 
 @pytest.fixture(scope="module")
 def with_states(tmp_path_factory) -> Iterator[Path]:
-    """A set whose states are random numbers of many sizes; one pose never changes."""
+    """A dataset with random states of different scales; one pose coordinate is constant."""
     folder = tmp_path_factory.mktemp("states")
     path = write_fake_set(folder / "walker_walk" / "expert", [ROWS] * 5, physics_dim=18)
     physics = np.random.default_rng(0).normal(size=(5 * ROWS, 18)) * 10.0 ** np.arange(-2, 4).repeat(3) + 7
@@ -63,14 +63,14 @@ def frozen(encoder: Path, dataset: Dataset, mode: str = "resample") -> FrozenEnc
 
 
 def percent(error: torch.Tensor, dataset: Dataset) -> np.ndarray:
-    """Mean absolute errors (P,) in percent of each coordinate's standard deviation; a constant one's must be 0."""
+    """Mean absolute errors (P,) in percent of each coordinate's standard deviation; constant ones must have error 0."""
     states = dataset.states().double().numpy()
     std, found = states.std(0), error.abs().double().numpy().mean(0)
     assert found[states.std(0) < 1e-6].tolist() == [0.0]
     return 100 * found[std > 1e-6] / std[std > 1e-6]
 
 
-def test_the_error_is_as_large_as_was_asked_in_a_probes_unit(noisy, with_states):
+def test_state_noise_has_the_requested_probe_error(noisy, with_states):
     dataset = open_dataset(with_states)
     made = frozen(noisy, dataset)
     view = made.view(0)
@@ -87,15 +87,15 @@ def test_the_error_is_as_large_as_was_asked_in_a_probes_unit(noisy, with_states)
     for z, at in ((batch.z, rows), (batch.next_z, rows + 1)):
         assert percent(z - dataset.states()[at], dataset)[8:].mean() == pytest.approx(VELOCITY, rel=0.05)
     position, again = sampler.state_dict(), [made.rows(rows, rows, sampler.view) for _ in range(2)]
-    assert not (again[0] == again[1])[:, [0, 2]].any(), "drawn anew whenever a row enters a batch"
+    assert not (again[0] == again[1])[:, [0, 2]].any(), "noise is redrawn whenever a row enters a batch"
     sampler.load_state_dict(position)
     following = sampler.sample()
     sampler.load_state_dict(position)
-    assert torch.equal(sampler.sample().z, following.z), "a training that goes on has the noise of one never cut"
+    assert torch.equal(sampler.sample().z, following.z), "a resumed training draws the same noise"
 
 
 @pytest.mark.parametrize("mode", ["resample", "emission"])
-def test_noise_is_drawn_for_every_row_and_view_unless_a_row_always_looks_the_same(noisy, with_states, mode):
+def test_state_noise_is_independent_per_row_and_view(noisy, with_states, mode):
     dataset = open_dataset(with_states)
     made = frozen(noisy, dataset, mode)
     first, again, second = (made.episode(0, made.view(number)) for number in (0, 0, 1))
@@ -103,10 +103,10 @@ def test_noise_is_drawn_for_every_row_and_view_unless_a_row_always_looks_the_sam
     assert torch.equal(first, second) == (mode == "emission")
     error = (first - dataset.states()[:ROWS])[:, [0, 2, 10, 17]]
     table = np.corrcoef(torch.cat([error[:-1], error[1:]], 1).T.double().numpy())
-    assert np.abs(table - np.eye(8)).max() < 0.2, "coordinates and neighbouring rows have noise of their own"
+    assert np.abs(table - np.eye(8)).max() < 0.2, "noise is independent across coordinates and neighbouring rows"
 
 
-def test_normal_draws_are_normal_and_depend_on_their_key_alone():
+def test_keyed_normal_draws():
     key = derive_keys(3, torch.arange(40_000))
     draws = draw_normals(key, 3)
     assert (draws.shape, draws.dtype) == ((40_000, 3), torch.float64)
@@ -119,13 +119,13 @@ def test_normal_draws_are_normal_and_depend_on_their_key_alone():
 
 @pytest.fixture
 def hidden(with_states, tmp_path) -> Path:
-    """Half of the standardised coordinates are hidden from a memory."""
+    """An encoder with memory that hides half of the standardised coordinates."""
     config = smoke_pretrain(with_states, tmp_path / "hidden", frame_encoder="state", hidden_share=0.5)
     return run_pretrain(config).path / "encoder"
 
 
 @pytest.mark.parametrize("encoder", ["noisy", "hidden"])
-def test_a_stream_of_rows_is_seen_as_a_batch_of_them_and_keyed_by_seed_episode_and_row(encoder, request):
+def test_streamed_noise_equals_batched_noise(encoder, request):
     loaded = load_encoder(request.getfixturevalue(encoder))[0]
     agent = Agent(loaded, Policy(loaded.dim, 6, 8))
     env = CorruptedEnv(WALKER, CorruptionConfig.of("patch"), length=4, draws="nothing")
@@ -142,10 +142,10 @@ def test_a_stream_of_rows_is_seen_as_a_batch_of_them_and_keyed_by_seed_episode_a
     if encoder == "noisy":
         assert (batch != torch.stack(states)).sum(1).tolist() == [17] * 5
     else:
-        assert 20 < (batch == 0).sum() < 70, "of 90 coordinates, half"
+        assert 20 < (batch == 0).sum() < 70, "about half of 90 coordinates"
 
 
-def test_evaluation_repeats_whatever_the_number_of_workers(noisy, plain, tmp_path):
+def test_noisy_evaluation_does_not_depend_on_worker_count(noisy, plain, tmp_path):
     torch.manual_seed(0)
     policy = Policy(18, 6, 8)
     with torch.no_grad():
@@ -158,30 +158,30 @@ def test_evaluation_repeats_whatever_the_number_of_workers(noisy, plain, tmp_pat
         jobs = [EpisodeJob(*places, WALKER, under, e, film=False, length=6) for e in (0, 1)]
         return [episode.total for episode in evaluate(jobs, workers)]
 
-    alone = totals(noisy, 1)
-    assert totals(noisy, 2) == alone
-    assert not set(totals(plain, 1)) & set(alone), "the noise changes what is done"
+    with_one = totals(noisy, 1)
+    assert totals(noisy, 2) == with_one
+    assert not set(totals(plain, 1)) & set(with_one), "noise changes the actions"
 
 
-def test_either_kind_of_noise_leaves_the_other_coordinates_alone(with_states, tmp_path):
+def test_pose_and_velocity_noise_are_separate(with_states, tmp_path):
     dataset = open_dataset(with_states)
     for name, touched in (("pose_noise", slice(0, 9)), ("velocity_noise", slice(9, 18))):
         made = frozen(pretrained(with_states, tmp_path / name, **{name: 10.0}), dataset)
         changed = (made.episode(0, made.view(0)) != dataset.states()[:ROWS]).any(0)
         expected = torch.zeros(18, dtype=torch.bool)
         expected[touched] = True
-        expected[1] = False  # the pose that never changes: the simulator's column 3, after place and angle
+        expected[1] = False  # the constant pose: the simulator's column 3
         assert torch.equal(changed, expected)
 
 
-def test_a_scale_tells_constant_coordinates():
+def test_state_scale_of_constant_coordinates_is_zero():
     scale = StateScale.fit(torch.tensor([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0]]), pose=1)
     assert (scale.mean.tolist(), scale.std.tolist()) == ([2.0, 5.0, 0.0], [1.0, 0.0, 2.0])
     assert scale.noise(100, 50).tolist() == pytest.approx([(np.pi / 2) ** 0.5, 0, (np.pi / 2) ** 0.5])
 
 
-def test_states_are_kept_in_full_precision(with_states, plain, tmp_path):
-    """A coordinate that never changes is scaled up: rounded to half precision, it would be another in evaluation."""
+def test_state_features_are_cached_in_fp32(with_states, plain, tmp_path):
+    """A nearly constant coordinate is scaled up, so half precision would change it in evaluation."""
     dataset = open_dataset(with_states)
     dataset.physics[:, 3] = 1.3
     histories = Histories(dataset, NO_OPTIONS, 1, 0)

@@ -1,4 +1,4 @@
-"""Fine-tuning: cut anywhere and started again, it ends in the files of an uninterrupted run."""
+"""Fine-tuning: resumption, results and metrics of a run."""
 
 import csv
 import json
@@ -28,11 +28,11 @@ from vd4rl_pomdp.runs.results import find_results
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 CORRUPTION = "patch+zero_frames"
-"""What `encoder` was pretrained under."""
+"""The pretraining corruption of `encoder`."""
 
 
 def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **changes: object) -> Path:
-    """Fine-tune in one go, and again with a cut at the second checkpoint; both must agree. Returns the whole run."""
+    """Fine-tune uninterrupted, and again with a cut at the second checkpoint; assert equality; return the first run."""
     whole = run_finetune(smoke_finetune(encoder, data, out / "whole", **changes))
     cut = smoke_finetune(encoder, data, out / "cut", **changes)
     with monkeypatch.context() as patch:
@@ -44,8 +44,8 @@ def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **
     return whole.path
 
 
-def test_finetuning_on_exact_batches_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch):
-    """On cached features: `test_interruptions.py`; `check_algorithm` proves it of every algorithm's updates."""
+def test_exact_batches_resume_bit_exactly(encoder, data, tmp_path, monkeypatch):
+    """`test_interruptions.py` covers cached features, `check_algorithm` the updates of every algorithm."""
     changes = {"views": 0, "eval_length": 2, "updates": 12, "eval_every": 6}
     changes |= {"checkpoint_every": 4, "batch_size": 4}
     monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
@@ -61,27 +61,27 @@ def test_finetuning_on_exact_batches_resumes_to_the_bit(encoder, data, tmp_path,
     assert not (whole / "features.npy").exists()
 
 
-def test_runs_of_one_view_seed_train_other_networks_on_the_same_features(encoder, data, tmp_path):
+def test_view_seed_fixes_features_but_not_networks(encoder, data, tmp_path):
     def trained(name: str, **seeds: int) -> dict[str, torch.Tensor]:
         run = run_finetune(smoke_finetune(encoder, data, tmp_path / name, **BRIEF, **seeds))
         assert run.config["view_seed"] == seeds.get("view_seed")
         return load_file(run.path / "policy" / "model.safetensors")
 
-    plain, told = trained("plain", seed=0), trained("told", seed=0, view_seed=0)
-    assert all(torch.equal(plain[name], told[name]) for name in plain), "the run's own seed is the default"
+    plain, explicit = trained("plain", seed=0), trained("explicit", seed=0, view_seed=0)
+    assert all(torch.equal(plain[name], explicit[name]) for name in plain), "the default is the run's seed"
     other, own = trained("other", seed=1, view_seed=0), trained("own", seed=1)
-    for name in ("standardise.mean", "standardise.std"):  # statistics of the features
+    for name in ("standardise.mean", "standardise.std"):  # feature statistics
         assert torch.equal(other[name], plain[name])
         assert not torch.equal(own[name], plain[name])
     assert not torch.equal(other["net.0.weight"], plain["net.0.weight"])
 
 
-def test_a_stack_of_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypatch):
+def test_stack_with_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypatch):
     encode, encoded = FrozenEncoder.frames, []
     monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
-    told = [smoke_finetune(encoder, data, tmp_path / f"seed{n}", seed=n, view_seed=7, **BRIEF) for n in (0, 1)]
-    runs = train.finetune_all(told)
-    assert len(encoded) == 3, "episodes"
+    configs = [smoke_finetune(encoder, data, tmp_path / f"seed{n}", seed=n, view_seed=7, **BRIEF) for n in (0, 1)]
+    runs = train.finetune_all(configs)
+    assert len(encoded) == 3, "one call per episode"
     assert all(run.finished and not (run.path / "features.npy").exists() for run in runs)
 
 
@@ -94,9 +94,7 @@ HIDDEN = {"method": "mik+a", "frame_encoder": "state", "hidden_share": 0.5, "cor
 
 
 @pytest.mark.parametrize("settings", [{"method": "drq_bc"}, HIDDEN], ids=["drq_bc", "hidden"])
-def test_an_encoder_that_is_trained_along_or_reads_states_resumes_to_the_bit(
-    with_states, tmp_path, monkeypatch, settings
-):
+def test_end_to_end_and_state_encoders_resume_bit_exactly(with_states, tmp_path, monkeypatch, settings):
     made = run_pretrain(smoke_pretrain(with_states, tmp_path / "made", **settings)).path / "encoder"
     changes = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2}
     whole = finetune_cut_and_whole(monkeypatch, made, with_states, tmp_path, **changes)
@@ -106,10 +104,10 @@ def test_an_encoder_that_is_trained_along_or_reads_states_resumes_to_the_bit(
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert {row["algorithm"] for row in rows} == {"drqv2_bc" if along else "td3_bc"}
     critic = json.loads((whole / "critic.json").read_text())
-    assert (critic["value"] != 0, critic["moved"]) == (True, None), "two rows of metrics tell of no movement"
+    assert (critic["value"] != 0, critic["moved"]) == (True, None), "two rows of metrics are too few for a slope"
 
 
-def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):
+def test_state_encoder_reads_pose_and_velocity(with_states, data, tmp_path):
     encoder, _ = load_encoder(
         run_pretrain(smoke_pretrain(with_states, tmp_path / "s", method="state")).path / "encoder"
     )
@@ -127,18 +125,18 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
-def test_a_gpu_that_there_is_not_leaves_no_run_behind(data, encoder, tmp_path):
+def test_missing_gpu_leaves_no_run(data, encoder, tmp_path):
     """Other wrong values are in `test_bad_flags.py`."""
     with pytest.raises(UserError, match="no such GPU"):
         run_finetune(smoke_finetune(encoder, data, tmp_path / "out", device="cuda:99"))
     assert not (tmp_path / "out").exists()
 
 
-def test_sets_that_an_encoder_cannot_read_are_one_line(encoder, data, tmp_path):
+def test_datasets_unfit_for_the_encoder_are_rejected(encoder, data, tmp_path):
     other = write_fake_set(tmp_path / "humanoid_walk" / "expert", [20, 20], action_dim=21)
     single = write_fake_set(tmp_path / "single" / "walker_walk", [1, 1])
-    for given, told in ((other, "6 action dimensions"), (single, "holds no transition")):
-        with pytest.raises(UserError, match=told):
+    for given, message in ((other, "6 action dimensions"), (single, "holds no transition")):
+        with pytest.raises(UserError, match=message):
             run_finetune(smoke_finetune(encoder, given, tmp_path / "out"))
     shutil.copytree(encoder, tmp_path / "small")
     config = json.loads((tmp_path / "small" / "config.json").read_text())
@@ -149,7 +147,7 @@ def test_sets_that_an_encoder_cannot_read_are_one_line(encoder, data, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_finished_run_that_lost_a_result_says_so_and_writes_it_anew(run, encoder, data):
+def test_missing_result_of_finished_run_is_reported_and_rewritten(run, encoder, data):
     config = smoke_finetune(encoder, data, run, **BRIEF)
     for name in RESULTS:
         kept = (run / name).rename(run / "kept")
@@ -168,9 +166,7 @@ def test_a_finished_run_that_lost_a_result_says_so_and_writes_it_anew(run, encod
     ("folder", "lengths", "quality"),
     [("medium", [20, 25], "medium"), (".", [20, 25], "unknown"), (".", [20, 25, 30], "expert")],
 )
-def test_rows_have_the_quality_of_the_policys_set_or_the_encoders_if_both_learned_from_one(
-    encoder, tmp_path, monkeypatch, folder, lengths, quality
-):
+def test_quality_label_comes_from_policy_dataset_or_encoder(encoder, tmp_path, monkeypatch, folder, lengths, quality):
     other = write_fake_set(tmp_path / "walker_walk" / folder, lengths)
     monkeypatch.setattr(trainer, "encode_views", lambda *_: (_ for _ in ()).throw(CutError))  # the names come before
     with pytest.raises(CutError):
@@ -178,7 +174,7 @@ def test_rows_have_the_quality_of_the_policys_set_or_the_encoders_if_both_learne
     assert json.loads((tmp_path / "out" / "labels.json").read_text())["quality"] == quality
 
 
-def test_a_policy_that_diverges_before_an_evaluation_is_marked_and_not_kept(encoder, data, tmp_path):
+def test_diverged_policy_is_marked_and_not_saved(encoder, data, tmp_path):
     config = smoke_finetune(
         encoder, data, tmp_path / "out", updates=20, eval_every=10, log_every=20, batch_size=4, learning_rate=1e9
     )
@@ -188,7 +184,7 @@ def test_a_policy_that_diverges_before_an_evaluation_is_marked_and_not_kept(enco
     assert not (config.out / "policy").exists()
 
 
-def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, tmp_path):
+def test_metrics_contain_scores_by_evaluation_corruption(encoder, data, tmp_path):
     changes = {"updates": 4, "eval_every": 2, "eval_episodes": 2, "batch_size": 4, "eval_length": 2}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes))
     episodes = list(csv.DictReader((run.path / "episodes.csv").open()))
@@ -205,26 +201,26 @@ def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, t
 
 
 @pytest.mark.parametrize("algorithm", ["td3_bc", "drqv2_bc", "iql", "bc"])
-def test_a_run_ends_with_what_its_critic_came_to(encoder, data, tmp_path, algorithm):
-    """Of the rows of its metrics; resumed runs and stacks are held against whole and single ones elsewhere."""
+def test_run_stores_critic_summary(encoder, data, tmp_path, algorithm):
+    """Computed from the rows of metrics.jsonl."""
     changes = {"updates": 15, "log_every": 1, "batch_size": 4, "eval_length": 2, "eval_every": 15, "eval_clean": False}
     changes |= {} if algorithm == "bc" else {"gamma": 0.9, "n_step": 2}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", algorithm=algorithm, **changes))
     assert {row["evaluated_under"] for row in csv.DictReader((run.path / "episodes.csv").open())} == {CORRUPTION}
-    told = json.loads((run.path / "critic.json").read_text())
+    critic = json.loads((run.path / "critic.json").read_text())
     if algorithm == "bc":
-        assert told == {}
+        assert critic == {}
         return
     q = [row["q"] for row in read_metrics(run.path / "metrics.jsonl") if row["step"] > 12 and "q" in row]
-    assert told["value"] == pytest.approx(np.mean(q), abs=1e-4)
-    assert told["moved"] == pytest.approx((q[2] - q[0]) / 2 * 3 / np.mean(q), rel=1e-3)
+    assert critic["value"] == pytest.approx(np.mean(q), abs=1e-4)
+    assert critic["moved"] == pytest.approx((q[2] - q[0]) / 2 * 3 / np.mean(q), rel=1e-3)
     dataset = open_dataset(data)
     earned = dataset.reward[dataset.t > 0].double().mean()
-    assert told["data"] == pytest.approx(float(earned) / (1 - 0.9), abs=1e-3)
+    assert critic["data"] == pytest.approx(float(earned) / (1 - 0.9), abs=1e-3)
 
 
-def test_a_run_cut_behind_an_evaluation_has_the_metrics_of_a_whole_one(encoder, data, tmp_path, monkeypatch):
-    """A cut before is in `test_interruptions.py`."""
+def test_run_cut_after_an_evaluation_resumes_identically(encoder, data, tmp_path, monkeypatch):
+    """`test_interruptions.py` covers a cut before the evaluation."""
     changes = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
     whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
     cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
@@ -241,8 +237,8 @@ def test_a_run_cut_behind_an_evaluation_has_the_metrics_of_a_whole_one(encoder, 
     assert contents(cut.out) == contents(whole.path)
 
 
-def test_the_clean_evaluation_may_have_another_number_of_episodes_and_is_made_up_for(encoder, data, tmp_path):
-    """The same rows, whatever else is played; a run that was cut within its last evaluation plays it again."""
+def test_clean_evaluation_has_its_own_episode_count_and_is_completed(encoder, data, tmp_path):
+    """Shared episodes have equal rows; a run cut within its last evaluation completes it."""
     few = {"updates": 4, "eval_every": 2, "batch_size": 4, "eval_length": 2, "eval_episodes": 3}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **few, eval_clean_episodes=2)).path
     rows = [(row["step"], row["evaluated_under"]) for row in csv.DictReader((run / "episodes.csv").open())]
@@ -258,17 +254,18 @@ def test_the_clean_evaluation_may_have_another_number_of_episodes_and_is_made_up
     assert find_results([run])[0].id == find_results([whole])[0].id
 
 
-def test_the_cost_of_the_pretraining_comes_along_with_a_copied_encoder(encoder, data, tmp_path):
+def test_pretraining_time_is_copied_with_the_encoder(encoder, data, tmp_path):
     few = {"updates": 2, "batch_size": 4, "eval_episodes": 0}
     first = run_finetune(smoke_finetune(encoder, data, tmp_path / "first", **few)).path
     again = run_finetune(smoke_finetune(first / "encoder", data, tmp_path / "again", **few)).path
-    told = [json.loads(path.read_text()) for path in (encoder.parent / "timing.json", again / "pretrain_timing.json")]
-    assert told[0] == told[1]
+    timings = (encoder.parent / "timing.json", again / "pretrain_timing.json")
+    first_timing, copied_timing = (json.loads(path.read_text()) for path in timings)
+    assert first_timing == copied_timing
 
 
 @pytest.mark.parametrize(("views", "hidden_dim", "threads"), [(1, 32, 1), (0, 32, 2), (1, 513, 2)])
-def test_small_networks_are_updated_by_one_thread(encoder, data, tmp_path, monkeypatch, views, hidden_dim, threads):
-    """Several would wait for each other between small products."""
+def test_small_networks_use_one_thread(encoder, data, tmp_path, monkeypatch, views, hidden_dim, threads):
+    """Several threads would stall between small matrix products."""
     seen, loss, before = set(), TD3BC.critic_loss, torch.get_num_threads()
 
     def watched(self, *arguments):

@@ -1,4 +1,4 @@
-"""Twenty updates end in the weights that the authors' rules end in, written out here line by line, in float64."""
+"""Twenty updates reproduce the weights of the authors' update rules, transcribed here in float64."""
 
 import copy
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from vd4rl_pomdp.nn.policy import Policy
 
 DIM, ACTIONS, SIZE, UPDATES, PIXELS = 3, 2, 64, 20, 12
 BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0, "rebrac": 0, "fql": 0}
-"""Updates before the first: the noise of V-D4RL ends to fall at the tenth of those made here."""
+"""Initial update count, so that V-D4RL's noise schedule reaches its minimum at the tenth update here."""
 
 
 @pytest.fixture(autouse=True)
@@ -39,13 +39,13 @@ def batch(number: int) -> FeatureBatch:
 
 
 def started(name: str) -> TD3BC:
-    """An algorithm whose policy chooses many actions near the bounds."""
+    """An algorithm whose policy chooses many actions near the bounds, so clipping matters."""
     torch.manual_seed(0)
     policy = Policy(DIM, ACTIONS, 16)
     with torch.no_grad():
         policy.net[-1].weight.mul_(30)
-    told = {"gamma": 0.9, "alpha": 1.5, "actor_bc": 0.3, "critic_bc": 0.7, "distillation": 2.0}
-    options = ALGORITHMS[name].options.fill(told)
+    settings = {"gamma": 0.9, "alpha": 1.5, "actor_bc": 0.3, "critic_bc": 0.7, "distillation": 2.0}
+    options = ALGORITHMS[name].options.fill(settings)
     algorithm = ALGORITHMS[name](policy, options, 1e-3, 550_000, RandomStream(torch.Generator().manual_seed(7)))
     algorithm.updates = BEGUN[name]
     return algorithm
@@ -90,7 +90,7 @@ class Nets:
 
 
 def truncated(mean: Tensor, std: float, noise: Tensor) -> Tensor:
-    """A sample of V-D4RL's truncated normal: its value is cut off, its gradient is not."""
+    """A sample of V-D4RL's truncated normal: the value is clipped, the gradient is not."""
     x = mean + torch.clamp(noise * std, -0.3, 0.3)
     cut = torch.clamp(x, -1.0 + 1e-6, 1.0 - 1e-6)
     return x - x.detach() + cut.detach()
@@ -148,7 +148,7 @@ def rebrac(nets: Nets, b: FeatureBatch, step: int) -> None:
 
 
 @pytest.mark.parametrize("theirs", [drqv2_bc, bc, td3_bc, rebrac])
-def test_updates_end_in_the_weights_of_the_authors_rule(theirs: Callable):
+def test_updates_reproduce_the_authors_weights(theirs: Callable):
     name = theirs.__name__
     algorithm = started(name)
     nets = Nets(algorithm)
@@ -178,7 +178,7 @@ def gelu(x: Tensor) -> Tensor:
 
 
 def layered(weights: list[Tensor], x: Tensor, last: Callable, norm: bool = False) -> Tensor:
-    """A perceptron of GELU, each hidden layer normalised behind it if told."""
+    """An MLP with GELU; `norm` adds layer normalisation after each hidden layer."""
     while len(weights) > 2:
         weight, bias, *weights = weights
         x = gelu(x @ weight.T + bias)
@@ -189,7 +189,7 @@ def layered(weights: list[Tensor], x: Tensor, last: Callable, norm: bool = False
 
 
 class FlowNets:
-    """Copies of FQL's weights, and its networks written out: a state, its action and a time are one input."""
+    """Copies of FQL's weights and its networks, whose input is the concatenation of state, action and time."""
 
     def __init__(self, algorithm: FQL) -> None:
         def copies(module: nn.Module) -> list[Tensor]:
@@ -236,8 +236,8 @@ class FlowNets:
                 p.copy_(0.005 * q.detach() + 0.995 * p)
 
 
-def test_fqls_updates_end_in_the_weights_of_the_authors_rule():
-    """One step of all networks along one loss, in which none but its own loss moves each (Park et al., algorithm 1)."""
+def test_fql_updates_reproduce_the_authors_weights():
+    """One step on a joint loss; each network receives only the gradient of its own loss (Park et al., algorithm 1)."""
     algorithm = started("fql")
     nets, drawn = FlowNets(algorithm), torch.Generator().manual_seed(7)
     for number in range(UPDATES):
@@ -253,7 +253,7 @@ def test_fqls_updates_end_in_the_weights_of_the_authors_rule():
 
 
 class Eye(nn.Module):
-    """The part of an encoder that a memoryless method without a frozen stage has."""
+    """The frame encoder of a memoryless end-to-end method."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -268,8 +268,8 @@ def transitions(number: int) -> Transitions:
 
 
 @pytest.mark.parametrize("theirs", [drqv2_bc, bc])
-def test_without_a_frozen_stage_the_encoder_ends_in_the_authors_weights_too(theirs: Callable):
-    """V-D4RL steps its encoder along the critics' loss alone (bc along its only one), before the actor's step."""
+def test_end_to_end_updates_reproduce_the_authors_encoder(theirs: Callable):
+    """V-D4RL updates its encoder on the critics' loss (bc on its only loss), before the actor's step."""
     name = theirs.__name__
     algorithm, encoder = started(name), Eye()
     nets, eye = Nets(algorithm), copy.deepcopy(encoder.frame)

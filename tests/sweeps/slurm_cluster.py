@@ -1,4 +1,4 @@
-"""A Slurm of one node on this machine, from Debian's packages, which belongs to a test session and leaves nothing."""
+"""A temporary one-node Slurm cluster on this machine, from Debian's packages."""
 
 import os
 import shutil
@@ -42,7 +42,7 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=60 State=UP
 
 
 def why_not() -> str:
-    """Why none can be started here; empty if one can."""
+    """Why no cluster can be started here; empty if one can."""
     if find_spec("submitit") is None:
         return "no submitit: pip install '.[slurm]'"
     missing = [name for name in ("munged", "slurmctld", "slurmd", "sbatch") if shutil.which(name) is None]
@@ -53,21 +53,21 @@ def why_not() -> str:
 
 @contextmanager
 def slurm(folder: Path) -> Iterator[Path]:
-    """A Slurm that is up; its slurm.conf."""
+    """Start a cluster and yield its slurm.conf."""
     key, configuration = folder / "munge.key", folder / "slurm.conf"
     key.write_bytes(os.urandom(128))
     key.chmod(0o400)
     for name in ("state", "spool"):
         (folder / name).mkdir()
-    told = {"host": socket.gethostname(), "ports": _free_ports(2), "folder": folder, "cpus": CPUS}
-    configuration.write_text(CONFIGURATION.format(**told))
+    settings = {"host": socket.gethostname(), "ports": _free_ports(2), "folder": folder, "cpus": CPUS}
+    configuration.write_text(CONFIGURATION.format(**settings))
     paths = {name: folder / f"munge.{name}" for name in ("socket", "pid", "seed", "log")}
     munged = ["munged", "--foreground", "--force", f"--key-file={key}"]
     munged += [f"--{name}{'' if name == 'socket' else '-file'}={path}" for name, path in paths.items()]
     started: list[subprocess.Popen] = []
     environment = os.environ | {"SLURM_CONF": str(configuration)}
     try:
-        for words in (munged, ["slurmctld", "-D"], ["slurmd", "-D", "-N", told["host"]]):
+        for words in (munged, ["slurmctld", "-D"], ["slurmd", "-D", "-N", settings["host"]]):
             with (folder / f"{words[0]}.out").open("wb") as out:
                 started.append(subprocess.Popen(words, env=environment, stdout=out, stderr=out))
             until(paths["socket"].exists)
@@ -75,17 +75,17 @@ def slurm(folder: Path) -> Iterator[Path]:
         yield configuration
     finally:
         subprocess.run(["scancel", "--me"], env=environment, check=False)
-        until(lambda: not _told(["squeue", "--noheader"], environment))
+        until(lambda: not _output_of(["squeue", "--noheader"], environment))
         for process in reversed(started):
             process.terminate()
             process.wait(30)
 
 
 def _state(environment: dict[str, str]) -> str:
-    return _told(["sinfo", "--noheader", "--format=%T"], environment)
+    return _output_of(["sinfo", "--noheader", "--format=%T"], environment)
 
 
-def _told(words: list[str], environment: dict[str, str]) -> str:
+def _output_of(words: list[str], environment: dict[str, str]) -> str:
     return subprocess.run(words, env=environment, capture_output=True, text=True, check=False).stdout.strip()
 
 

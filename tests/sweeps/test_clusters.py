@@ -1,4 +1,4 @@
-"""Sweeps on a Slurm and a Ray of this machine: all is finished although tasks are cancelled and nodes die."""
+"""Sweeps on a local Slurm and Ray finish despite cancelled tasks and failing nodes."""
 
 import os
 import socket
@@ -28,14 +28,14 @@ def quick(monkeypatch):
 
 
 def retry(*words):
-    """`sweep retry` in a process of its own, which need not import what this one has."""
+    """`sweep retry` in a fork, which need not import the package again."""
     process = get_context("fork").Process(target=main, args=(["sweep", "retry", *map(str, words)],))
     process.start()
     return process
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not())
-def test_a_sweep_under_slurm_is_finished_although_a_task_is_cancelled(tmp_path, monkeypatch):
+def test_slurm_sweep_finishes_after_a_cancelled_task(tmp_path, monkeypatch):
     with slurm(tmp_path) as configuration:
         monkeypatch.setenv("SLURM_CONF", str(configuration))
         monkeypatch.setenv("PYTHONPATH", os.getcwd())
@@ -45,8 +45,8 @@ def test_a_sweep_under_slurm_is_finished_although_a_task_is_cancelled(tmp_path, 
         words = "--executor slurm --gpus 0 --cpus 2 --tasks 4 --time 30 --jobs-per-task 2"
         process = retry(out, *words.split())
         until(lambda: all(map(begun, jobs)))
-        told = ["squeue", "--array", "--noheader", "--format=%i"]
-        tasks = subprocess.run(told, capture_output=True, text=True, check=True).stdout.split()
+        squeue = ["squeue", "--array", "--noheader", "--format=%i"]
+        tasks = subprocess.run(squeue, capture_output=True, text=True, check=True).stdout.split()
         assert len(tasks) == 2
         subprocess.run(["scancel", tasks[0]], check=True)
         until(lambda: sum(len(begun(one)) for one in jobs) > 3)
@@ -58,7 +58,7 @@ def test_a_sweep_under_slurm_is_finished_although_a_task_is_cancelled(tmp_path, 
 
 @pytest.fixture
 def fakes(tmp_path, monkeypatch):
-    """Slurm's commands as scripts, which note how they are called."""
+    """Slurm's commands as scripts that log their calls."""
     pytest.importorskip("submitit")
 
     def write(stack: int = 1, **scripts: str) -> SlurmCluster:
@@ -73,9 +73,7 @@ def fakes(tmp_path, monkeypatch):
     return write
 
 
-def test_what_slurm_refuses_or_does_not_answer_is_one_line_and_stopping_asks_before_it_ends(
-    fakes, tmp_path, monkeypatch, capsys
-):
+def test_slurm_errors_timeouts_and_stop(fakes, tmp_path, monkeypatch, capsys):
     task = ClusterTask(tmp_path, "", LocalOptions(), str(tmp_path))
     cluster = fakes(sbatch="echo invalid partition >&2; exit 1")
     with pytest.raises(UserError, match=r"Slurm rejected the job array .*invalid partition"):
@@ -97,40 +95,40 @@ def test_what_slurm_refuses_or_does_not_answer_is_one_line_and_stopping_asks_bef
     assert "tasks may still be running: scancel --me --name=" in capsys.readouterr().err
 
 
-def test_slurms_options_become_what_submitit_takes():
+def test_slurm_options_map_to_submitit_parameters():
     asked = SlurmOptions("gpu", "lab", "high", "a100", 90, 2, 16, 62.5, 8, 50, ["--exclusive", "reservation=mine"])
     found = {name.removeprefix("slurm_"): value for name, value in parameters(asked).items()}
     names = ("partition", "account", "qos", "constraint", "time", "mem", "gpus_per_node", "cpus_per_task")
     assert [found[name] for name in names] == ["gpu", "lab", "high", "a100", 90, "64000M", 2, 16]
     assert found["srun_args"] == ["--cpus-per-task=16"]
     assert found["additional_parameters"] == {"requeue": True, "exclusive": True, "reservation": "mine"}
-    assert found["signal_delay_s"] > 120, "time to end in"
+    assert found["signal_delay_s"] > 120, "time to save a checkpoint"
     assert (
         not {f"slurm_{name}" for name in (*names[:4], "mem", "gpus_per_node")} & parameters(SlurmOptions(gpus=0)).keys()
     )
 
 
-@pytest.mark.parametrize(("executor", "missing", "told"), [
+@pytest.mark.parametrize(("executor", "missing", "message"), [
     ("slurm", "submitit", "needs submitit: pip install '.[slurm]' in a clone of vd4rl-pomdp"),
     ("ray", "ray", "needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp"),
 ])  # fmt: skip
-def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys, executor, missing, told):
+def test_missing_extra_is_reported(tmp_path, monkeypatch, capsys, executor, missing, message):
     keep_plan(tmp_path, job(tmp_path, "one"))
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(SystemExit, match="2"):
         main(["sweep", "retry", str(tmp_path), "--executor", executor])
-    assert capsys.readouterr().err == f"error: --executor {executor} {told}\n"
+    assert capsys.readouterr().err == f"error: --executor {executor} {message}\n"
 
 
-def test_without_slurms_commands_one_is_told_where_to_start(tmp_path, monkeypatch):
+def test_missing_slurm_commands_are_reported(tmp_path, monkeypatch):
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match="--executor slurm finds no sbatch here"):
         SlurmCluster(SlurmOptions(), tmp_path)
 
 
-class Vain:
-    """A cluster whose tasks end before they start a job, after one look at which it does not answer."""
+class IdleCluster:
+    """A cluster whose tasks end before they start a job; its second answer is an error."""
 
     folder, tasks = Path("tasks"), 2
 
@@ -150,21 +148,19 @@ class Vain:
         self.stopped = True
 
 
-def test_a_cluster_that_does_nothing_ends_the_sweep_and_one_that_falls_silent_is_asked_again(
-    tmp_path, monkeypatch, capsys
-):
+def test_idle_cluster_ends_sweep_and_unavailable_one_is_retried(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(clusters, "LOOK_S", 0.0)
-    plan, cluster = keep_plan(tmp_path, *(job(tmp_path, name) for name in "abc")), Vain()
+    plan, cluster = keep_plan(tmp_path, *(job(tmp_path, name) for name in "abc")), IdleCluster()
     with pytest.raises(UserError, match="tasks end before they start a job: see tasks"):
         watch([plan], cluster, SweepFolder(tmp_path), "plan")
-    assert cluster.asked == [2] * 3, "as many as the jobs need, and no more than it may have"
+    assert cluster.asked == [2] * 3, "limited by the number of tasks"
     assert cluster.stopped
     assert capsys.readouterr().err == "warning: it does not answer; trying again\n"
 
 
-def test_a_task_is_asked_for_a_stack(fakes, tmp_path, monkeypatch):
+def test_one_task_is_requested_per_stack(fakes, tmp_path, monkeypatch):
     monkeypatch.setattr(clusters, "LOOK_S", 0.0)
-    plan, cluster = keep_plan(tmp_path, *(policy(tmp_path, name) for name in "abc")), Vain(stack=3)
+    plan, cluster = keep_plan(tmp_path, *(policy(tmp_path, name) for name in "abc")), IdleCluster(stack=3)
     with pytest.raises(UserError, match="tasks end before they start a job"):
         watch([plan], cluster, SweepFolder(tmp_path), "plan")
     assert cluster.asked == [1] * 3
@@ -188,11 +184,11 @@ DRIVER = "from vd4rl_pomdp.sweeps import clusters; clusters.LOOK_S = 1.0; from v
 
 
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
-def test_a_sweep_on_ray_is_finished_although_a_node_dies_and_a_driver_is_stopped(tmp_path):
-    """Each in a process of its own: one that has used Ray cannot be forked."""
+def test_ray_sweep_finishes_after_node_failure_and_driver_stop(tmp_path):
+    """Cluster and drivers are subprocesses, since a process that has used Ray cannot be forked."""
     unset = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}
-    told = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "PYTHONPATH": os.getcwd()}
-    run = {"env": unset | told, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    ray = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "PYTHONPATH": os.getcwd()}
+    run = {"env": unset | ray, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     jobs = [job(tmp_path / "out", name, ends=("wait",) * 4) for name in "ab"]
     keep_plan(tmp_path / "out", *jobs)
     with subprocess.Popen([sys.executable, "-c", RAY], **run) as cluster:
@@ -216,7 +212,7 @@ def test_a_sweep_on_ray_is_finished_although_a_node_dies_and_a_driver_is_stopped
 
 
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
-def test_a_ray_that_is_not_there_is_one_line(tmp_path):
+def test_unreachable_ray_cluster_is_reported(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(

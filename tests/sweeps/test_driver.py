@@ -1,4 +1,4 @@
-"""What is started when, what is tried again, that nothing is done twice, and what is told: with real processes."""
+"""The sweep driver: job order, retries, shared work and reports; with real processes."""
 
 import json
 import os
@@ -36,10 +36,10 @@ def causes(out, job):
 
 
 @pytest.mark.parametrize("at_once", [1, 2])
-def test_every_job_runs_once_after_those_it_needs_so_many_at_a_time(tmp_path, at_once):
+def test_jobs_run_once_in_dependency_order(tmp_path, at_once):
     a, b, c = jobs = [job(tmp_path, "a"), job(tmp_path, "b", "a"), job(tmp_path, "c", "a")]
     assert sweep(tmp_path, *jobs, at_once=at_once)
-    assert sweep(tmp_path, *jobs, at_once=at_once), "and not again"
+    assert sweep(tmp_path, *jobs, at_once=at_once), "finished jobs are not repeated"
     spans = [(seen["time"], float((one.folder / "ended").read_text())) for one in jobs for seen in begun(one)]
     assert len(spans) == 3
     assert spans[0][1] < min(spans[1][0], spans[2][0])
@@ -52,46 +52,46 @@ def test_every_job_runs_once_after_those_it_needs_so_many_at_a_time(tmp_path, at
     ("kill", "killed", TRIES), (TEMPORARY, "unavailable", TRIES), ("defect", "failed", 1), (1, "failed", 1),
     (2, "failed", 1),
 ])  # fmt: skip
-def test_what_can_pass_is_tried_again_what_fails_is_told_and_the_rest_goes_on(tmp_path, capsys, end, cause, attempts):
+def test_temporary_failures_are_retried_and_failures_reported(tmp_path, capsys, end, cause, attempts):
     bad, after, other = jobs = [
         job(tmp_path, "bad", ends=(end,) * attempts), job(tmp_path, "after", "bad"), job(tmp_path, "other"),
     ]  # fmt: skip
     assert not sweep(tmp_path, *jobs)
     assert (causes(tmp_path, bad), begun(after), other.finished) == ([cause] * attempts, [], True)
-    assert not sweep(tmp_path, *jobs), "it stays given up"
+    assert not sweep(tmp_path, *jobs), "failed jobs are not repeated"
     assert len(begun(bad)) == attempts
     capsys.readouterr()
     main(["sweep", "status", str(tmp_path), "--json"])
-    told = json.loads(capsys.readouterr().out)
-    assert told["states"] == {"bad": "failed", "after": "blocked", "other": "done"}
+    status = json.loads(capsys.readouterr().out)
+    assert status["states"] == {"bad": "failed", "after": "blocked", "other": "done"}
     line = "ValueError: what is wrong" if end == "defect" else "its last line"
-    assert told["failures"]["bad"]["line"] == line
+    assert status["failures"]["bad"]["line"] == line
     main(["sweep", "retry", str(tmp_path)])
     assert capsys.readouterr().out == "all 3 jobs are finished\n"
     assert (len(begun(bad)), len(begun(other))) == (attempts + 1, 1)
 
 
-def test_a_failed_sweep_ends_with_each_failure_in_a_line_and_what_to_do(tmp_path, capsys):
+def test_failed_sweep_prints_failures_and_retry_command(tmp_path, capsys):
     keep_plan(tmp_path, job(tmp_path, "bad", ends=(2,)))
     with pytest.raises(SystemExit, match="1"):
         main(["sweep", "retry", str(tmp_path)])
-    told = capsys.readouterr()
-    assert told.err.splitlines()[-1] == f"failed: bad: its last line (see {tmp_path}/sweep/logs/bad.log)"
+    shown = capsys.readouterr()
+    assert shown.err.splitlines()[-1] == f"failed: bad: its last line (see {tmp_path}/sweep/logs/bad.log)"
     program = tmp_path / "program.py"
     line = f"1 of 1 jobs are not finished, 1 failed; `python {program} sweep retry {tmp_path}` retries them\n"
-    assert told.out == line
+    assert shown.out == line
     main(["sweep", "status", str(tmp_path)])
     assert "1 jobs: 1 failed\n" in capsys.readouterr().out
 
 
-def test_a_corrected_command_and_one_that_passes_in_time_go_on(tmp_path):
+def test_corrected_command_runs_again(tmp_path):
     bad, flaky = job(tmp_path, "bad", ends=(2,)), job(tmp_path, "flaky", ends=("kill",) * (TRIES - 1))
     assert not sweep(tmp_path, bad, flaky)
     assert flaky.finished
     assert sweep(tmp_path, replace(bad, words=[*bad.words, "--corrected"]), flaky)
 
 
-def test_what_ends_well_and_leaves_nothing_of_its_own_has_failed(tmp_path):
+def test_job_without_finished_run_has_failed(tmp_path):
     nothing, another = job(tmp_path, "nothing", ends=(0,)), replace(job(tmp_path, "another"), recipe="of another run")
     assert not sweep(tmp_path, nothing, another)
     for one in (nothing, another):
@@ -99,7 +99,7 @@ def test_what_ends_well_and_leaves_nothing_of_its_own_has_failed(tmp_path):
         assert row["line"] == f"{one.folder}: holds nothing finished, though the command ended well"
 
 
-def test_what_was_done_once_and_is_gone_is_done_again(tmp_path):
+def test_deleted_run_is_repeated(tmp_path):
     one = job(tmp_path, "one")
     sweep(tmp_path, one)
     shutil.rmtree(one.folder)
@@ -107,7 +107,7 @@ def test_what_was_done_once_and_is_gone_is_done_again(tmp_path):
 
 
 def command(*words):
-    """A process of its own, which need not import what this one has."""
+    """Run a sweep command in a fork, which need not import the package again."""
     process = get_context("fork").Process(target=main, args=(["sweep", *map(str, words)],))
     process.start()
     return process
@@ -118,8 +118,8 @@ def code(process):
     return process.exitcode
 
 
-def test_a_killed_driver_is_followed_by_several_that_share_what_is_left(tmp_path):
-    """The jobs that it had begun go on, and are waited for."""
+def test_other_drivers_take_over_after_a_killed_driver(tmp_path):
+    """Jobs started by the killed driver continue, and the others wait for them."""
     jobs = [job(tmp_path, name, ends=("wait",)) for name in "abcdef"]
     keep_plan(tmp_path, *jobs)
     first = command("retry", tmp_path, "--jobs", "2")
@@ -136,7 +136,7 @@ def test_a_killed_driver_is_followed_by_several_that_share_what_is_left(tmp_path
     assert all(map(is_finished, jobs))
 
 
-def test_a_signal_ends_the_jobs_where_nothing_is_lost_and_is_no_attempt(tmp_path):
+def test_interrupted_jobs_do_not_count_as_attempts(tmp_path):
     one = job(tmp_path, "one", ends=("wait",) * 9)
     keep_plan(tmp_path, one)
     process = command("retry", tmp_path)
@@ -164,8 +164,8 @@ main(["bench"])
 """
 
 
-def test_a_second_signal_ends_a_job_no_sooner(monkeypatch):
-    """As a cluster sends it to all processes of a task, whose driver then asks its jobs to end."""
+def test_second_signal_does_not_kill_a_job(monkeypatch):
+    """A cluster signals all processes of a task; then the driver also signals its jobs."""
 
     def end():
         done = subprocess.run([sys.executable, "-c", SIGNALLED], capture_output=True, text=True, check=False)
@@ -176,7 +176,7 @@ def test_a_second_signal_ends_a_job_no_sooner(monkeypatch):
     assert end() == (143, "a checkpoint is written\n")
 
 
-def test_a_driver_that_helps_ends_when_others_have_all_that_could_start(tmp_path):
+def test_joined_driver_ends_when_no_job_can_start(tmp_path):
     one, _ = jobs = [job(tmp_path, "one", ends=("wait",)), job(tmp_path, "after", "one")]
     keep_plan(tmp_path, *jobs)
     process = command("retry", tmp_path)
@@ -187,7 +187,7 @@ def test_a_driver_that_helps_ends_when_others_have_all_that_could_start(tmp_path
     assert [len(begun(one)) for one in jobs] == [1, 1]
 
 
-def test_after_what_can_pass_every_driver_pauses(tmp_path, monkeypatch):
+def test_drivers_pause_after_temporary_failures(tmp_path, monkeypatch):
     one = job(tmp_path, "one", ends=(TEMPORARY,))
     monkeypatch.setattr(driver, "PAUSE_S", 1.0)
     assert sweep(tmp_path, one)
@@ -195,13 +195,13 @@ def test_after_what_can_pass_every_driver_pauses(tmp_path, monkeypatch):
     assert second - first > 1
     monkeypatch.setattr(driver, "PAUSE_S", 3600.0)
     two = job(tmp_path, "two")
-    told = {"job": "two", "cause": "killed", "line": "", "seconds": 1.0, "words": two.words}
-    SweepFolder(tmp_path).add(told | {"ended": time.time()})
+    row = {"job": "two", "cause": "killed", "line": "", "seconds": 1.0, "words": two.words}
+    SweepFolder(tmp_path).add(row | {"ended": time.time()})
     assert not sweep(tmp_path, two, helps=True)
     assert begun(two) == []
 
 
-def test_a_log_that_cannot_be_written_costs_its_own_job_an_attempt(tmp_path):
+def test_unwritable_log_fails_only_its_job(tmp_path):
     (tmp_path / "sweep" / "logs").mkdir(parents=True)
     (tmp_path / "sweep" / "logs" / "a.log").mkdir()
     a, b = jobs = [job(tmp_path, "a"), job(tmp_path, "b")]
@@ -210,12 +210,12 @@ def test_a_log_that_cannot_be_written_costs_its_own_job_an_attempt(tmp_path):
     assert b.finished
 
 
-def test_jobs_share_out_the_cores_and_the_gpus(tmp_path, monkeypatch):
+def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
     monkeypatch.setattr(driver, "visible_gpus", list)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
     assert [place.cores for place in driver.places(LocalOptions(jobs=3))] == [(0, 1), (2, 3, 4), (5, 6, 7)]
     assert [place.cores for place in driver.places(LocalOptions(jobs=16))] == [(n // 2,) for n in range(16)]
-    assert len(driver.places(LocalOptions())) == 1, "as many as there are GPUs, or one"
+    assert len(driver.places(LocalOptions())) == 1, "one per GPU, or one"
     monkeypatch.undo()
     monkeypatch.setattr(driver, "visible_gpus", lambda: ["2", "5"])
     assert sorted(place.gpu for place in driver.places(LocalOptions(jobs_per_gpu=3))) == ["2"] * 3 + ["5"] * 3
@@ -229,7 +229,7 @@ def test_jobs_share_out_the_cores_and_the_gpus(tmp_path, monkeypatch):
     assert os.sched_getaffinity(0) == before
 
 
-def test_the_row_after_one_that_a_full_disk_cut_is_whole(tmp_path, monkeypatch):
+def test_row_after_a_truncated_row_is_complete(tmp_path, monkeypatch):
     folder, one = SweepFolder(tmp_path), job(tmp_path, "one")
     row = {"job": "one", "cause": "killed", "line": "", "seconds": 1.0, "ended": 2.0, "words": one.words}
     folder.add(row)
@@ -243,7 +243,7 @@ def test_the_row_after_one_that_a_full_disk_cut_is_whole(tmp_path, monkeypatch):
         folder.add(row)
 
 
-def test_a_plan_is_read_from_elsewhere_and_not_carried_out_where_it_was_moved(tmp_path, monkeypatch, capsys):
+def test_moved_plan_is_readable_but_not_executed(tmp_path, monkeypatch, capsys):
     (tmp_path / "made").mkdir()
     monkeypatch.chdir(tmp_path / "made")
     out = tmp_path / "made" / "runs"
@@ -252,7 +252,7 @@ def test_a_plan_is_read_from_elsewhere_and_not_carried_out_where_it_was_moved(tm
     SweepFolder(out.relative_to(tmp_path / "made")).keep_plan("plan", plan.jobs, plan.program)
     monkeypatch.chdir(tmp_path)
     main(["sweep", "retry", "made/runs"])
-    assert one.finished, "its process ran where the plan was made"
+    assert one.finished, "the job ran in the folder where the plan was made"
     (tmp_path / "made" / "runs").rename(tmp_path / "moved")
     capsys.readouterr()
     main(["sweep", "status", "moved"])
@@ -263,7 +263,7 @@ def test_a_plan_is_read_from_elsewhere_and_not_carried_out_where_it_was_moved(tm
 
 
 @pytest.mark.parametrize("text", ["[{", "{}", "[3]", '{"made_in": "/", "out": "runs", "program": [], "jobs": [{}]}'])
-def test_a_damaged_plan_is_one_line(tmp_path, capsys, text):
+def test_damaged_plan_is_rejected(tmp_path, capsys, text):
     keep_plan(tmp_path, job(tmp_path, "one"))
     (tmp_path / "sweep" / "plans" / "plan.json").write_text(text)
     with pytest.raises(SystemExit, match="2"):

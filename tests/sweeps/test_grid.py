@@ -1,4 +1,4 @@
-"""Grids: axes, blocks, the testing subset, changes, and what is refused."""
+"""Grids: axes, blocks, where tables, the testing subset, changes, and invalid input."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ from vd4rl_pomdp.sweeps.stages import check_cells, collection_of, recipe_of, rec
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "sweeps.md"
 COMMITTED = [str(path) for path in sorted((ROOT / "results").rglob("*.toml")) if "[testing]" in path.read_text()]
-"""Grids of results, but for early ones."""
+"""Grids of committed results that have a testing section."""
 TOML = """
 title = "a trial"
 seed = [0, 1]
@@ -47,7 +47,7 @@ def file(tmp_path):
     return write
 
 
-def test_lists_are_axes_a_block_replaces_what_stands_above_it_and_first_seeds_come_first(file):
+def test_grid_axes_blocks_and_seed_order(file):
     cells = load_grid(file(TOML + BLOCKS)).cells()
     assert len(cells) == 2 * 2 * 2 + 4
     assert [cell.seed for cell in cells] == [0] * 6 + [1] * 6
@@ -56,10 +56,10 @@ def test_lists_are_axes_a_block_replaces_what_stands_above_it_and_first_seeds_co
     own = [cell for cell in cells if cell.value("history") == "gru"]
     assert {(cell.value("method"), cell.value("corruption")) for cell in own} == {("acro", "patch")}
     same = '[[block]]\n[[block]]\npretrain = { method = "acro" }\n'
-    assert len(load_grid(file(TOML + same)).cells()) == 8, "cells that two blocks share are one"
+    assert len(load_grid(file(TOML + same)).cells()) == 8, "duplicate cells are merged"
 
 
-def test_the_testing_subset_replaces_everything_and_changes_come_last_with_the_types_of_toml(file):
+def test_testing_section_and_changes_override_settings(file):
     path = file(TOML + BLOCKS)
     cells = load_grid(path, testing=True).cells()
     assert {(cell.seed, cell.value("task"), cell.value("preset")) for cell in cells} == {(7, "walker_walk", "smoke")}
@@ -74,13 +74,13 @@ def test_the_testing_subset_replaces_everything_and_changes_come_last_with_the_t
         load_grid(path, ["seed=3", "pretrain.steps=10", "seed = 4"])
 
 
-def test_a_python_file_defines_the_same(file):
+def test_python_grid_file(file):
     python = "GRID = {'seed': [s for s in range(3)], 'collect': {'task': 'walker_walk', 'quality': 'expert'}}"
     grid = load_grid(file(python, "mine.py"))
     assert (grid.name, [cell.seed for cell in grid.cells()]) == ("mine", [0, 1, 2])
 
 
-def test_only_keeps_cells_by_value_and_names_what_there_is(file):
+def test_only_filters_cells_by_value(file):
     cells = load_grid(file(TOML)).cells()
     kept = narrow(cells, ["task=walker_walk", "method = acro, mik+a", "seed=1"])
     assert [(cell.value("task"), cell.seed) for cell in kept] == [("walker_walk", 1)] * 2
@@ -117,12 +117,12 @@ def test_only_keeps_cells_by_value_and_names_what_there_is(file):
         ("title = ", r"is not a valid grid \(TOMLDecodeError"),
     ],
 )
-def test_what_is_no_grid_is_refused(file, text, message):
+def test_invalid_grids_are_rejected(file, text, message):
     with pytest.raises(UserError, match=message):
         load_grid(file(text)).cells()
 
 
-def test_a_name_of_two_sections_is_told_by_its_section(file):
+def test_ambiguous_setting_names_need_their_section(file):
     rates = "learning_rate = 0.001\n[finetune]\nlearning_rate = [0.001, 0.01]"
     path = file(f"[collect]\n[pretrain]\n{rates}\n[[where]]\nonly = ['finetune.learning_rate=0.01']\npreset = 'cpu'")
     cells = load_grid(path).cells()
@@ -146,7 +146,7 @@ def test_a_name_of_two_sections_is_told_by_its_section(file):
         "raise SystemError('no')",
     ],
 )
-def test_a_python_file_that_defines_none_is_refused(file, text):
+def test_invalid_python_grids_are_rejected(file, text):
     with pytest.raises(UserError, match=r"mine\.py"):
         load_grid(file(text, "mine.py"))
 
@@ -159,7 +159,7 @@ finetune = { updates = 80 }
 """
 
 
-def test_where_sets_what_the_cells_that_meet_all_conditions_have_and_yields_to_changes(file):
+def test_where_applies_to_matching_cells_before_changes(file):
     path = file(TOML + WHERE + '[testing]\npreset = "cpu"\n')
     cells = load_grid(path).cells()
     assert len(cells) == 8
@@ -186,23 +186,23 @@ def test_where_sets_what_the_cells_that_meet_all_conditions_have_and_yields_to_c
         ('only = ["task=cheetah_run"]\ntitle = "x"', "unknown section or setting 'title'"),
     ],
 )
-def test_a_where_that_says_nothing_is_refused(file, table, message):
+def test_invalid_where_tables_are_rejected(file, table, message):
     with pytest.raises(UserError, match=message):
         load_grid(file(f"{TOML}[[where]]\n{table}\n"))
 
 
-def test_a_condition_means_a_number_however_it_is_written(file):
-    told = TOML.replace("updates = 40", "learning_rate = [1e-3, 0.0001]\neval_clean = true")
-    cells = load_grid(f"{file(told)}").cells()
+def test_conditions_compare_numbers_by_value(file):
+    text = TOML.replace("updates = 40", "learning_rate = [1e-3, 0.0001]\neval_clean = true")
+    cells = load_grid(file(text)).cells()
     for only in ("finetune.learning_rate=1e-3", "finetune.learning_rate=0.001", "eval_clean=true"):
         assert len(narrow(cells, [only])) == len(cells) / (1 if "clean" in only else 2)
     where = '[[where]]\nonly = ["finetune.learning_rate=0.1e-2"]\nfinetune = { updates = 7 }\n'
-    assert [cell.value("updates") for cell in load_grid(file(told + where)).cells()].count(7) == len(cells) / 2
+    assert [cell.value("updates") for cell in load_grid(file(text + where)).cells()].count(7) == len(cells) / 2
 
 
 @pytest.mark.parametrize("testing", [False, True])
 @pytest.mark.parametrize("name", [*names(), *COMMITTED])
-def test_every_cell_of_a_kept_grid_is_one_that_its_stages_take(name, testing):
+def test_cells_of_shipped_and_committed_grids_are_valid(name, testing):
     cells = load_grid(name, testing=testing).cells()
     assert len(cells) == len({repr((cell.shared, cell.sections)) for cell in cells}) > 0
     check_cells(cells, name)
@@ -211,24 +211,24 @@ def test_every_cell_of_a_kept_grid_is_one_that_its_stages_take(name, testing):
         assert {cell.value("preset") for cell in cells} == {"smoke"}
 
 
-def test_the_papers_grids_are_its_figures_over_twelve_methods():
+def test_paper_grids_cover_the_papers_figures():
     for name, corruption in (("paper_patch", "patch"), ("paper_patch_zero", "patch+zero_frames")):
         cells = [c for c in load_grid(name).cells() if c.value("corruption") == corruption]
         found = {(c.value("task"), c.value("quality"), c.value("method"), c.seed) for c in cells}
-        assert len(found) == len(cells) == 3 * 3 * 14 * 5, "12 methods, the floor and a ceiling"
+        assert len(found) == len(cells) == 3 * 3 * 14 * 5, "12 methods, random and supervised+a"
 
 
-def test_navigation_at_20000_steps_has_the_published_cells_and_first_seeds_first():
+def test_navigation_budget_grid_differs_only_in_steps():
     cells = load_grid(str(ROOT / "results" / "navigation" / "budget" / "grid.toml")).cells()
     kept = {repr(recorded(cell, "navigation_train") | {"steps": 2500}) for cell in cells}
     usual = {repr(recorded(cell, "navigation_train")) for cell in load_grid("navigation").cells()}
-    assert kept <= usual, "all but the steps is as in the rows they stand beside"
+    assert kept <= usual, "equal to the published cells except for steps"
     assert [cell.seed for cell in cells] == [0] * 5 + [1] * 5 + [2] * 5
-    told = {(cell.value("method"), cell.value("max_k")) for cell in cells}
-    assert told == {("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)}
+    methods = {(cell.value("method"), cell.value("max_k")) for cell in cells}
+    assert methods == {("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)}
 
 
-def test_the_leads_shorter_pretrainings_are_runs_of_the_protocol():
+def test_lead_grid_shares_its_short_pretrainings_with_the_protocol():
     def made(name, *only):
         cells = narrow(load_grid(str(ROOT / "results" / name)).cells(), only)
         return {(recipe_of(cell, "finetune"), repr(sorted(collection_of(cell).items()))) for cell in cells}
@@ -238,25 +238,25 @@ def test_the_leads_shorter_pretrainings_are_runs_of_the_protocol():
     assert len(made("lead/grid.toml", "steps=20000")) == 2 * 3 * 5
 
 
-def test_memories_are_compared_with_runs_of_the_protocol():
+def test_memories_grid_shares_its_gru_runs_with_the_protocol():
     cells = load_grid(str(ROOT / "results" / "memories" / "grid.toml")).cells()
     protocol = {recipe_of(cell, "finetune") for cell in load_grid(str(ROOT / "results" / "protocol.toml")).cells()}
     assert [cell.value("history") for cell in cells] == [None, "transformer", "lru"] * 3
     for gru, *others in zip(cells[::3], cells[1::3], cells[2::3], strict=True):
         assert recipe_of(gru, "finetune") in protocol
-        assert all(collection_of(other) == collection_of(gru) for other in others), "from one set"
+        assert all(collection_of(other) == collection_of(gru) for other in others), "the same dataset"
 
 
-def test_the_grid_of_published_files_is_the_protocols_first_layer_without_states():
+def test_vd4rl_grid_is_a_subset_of_the_protocol():
     cells, protocol = load_grid("vd4rl").cells(), load_grid(str(ROOT / "results" / "protocol.toml")).cells()
     assert not {cell.value("method") for cell in cells} & {"state", "supervised", "supervised+a"}
     assert {cell.seed for cell in cells} == set(range(5))
-    assert len({repr(collection_of(cell)) for cell in cells}) == 4, "two tasks, two qualities: seeds share a set"
+    assert len({repr(collection_of(cell)) for cell in cells}) == 4, "two tasks, two qualities; seeds share datasets"
     first, theirs = ({recipe_of(c, "finetune") for c in narrow(grid, ["seed=0"])} for grid in (cells, protocol))
     assert first < theirs
 
 
-def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
+def test_navigation_grid_covers_the_papers_tables():
     cells = load_grid("navigation").cells()
     held = {
         (
@@ -274,7 +274,7 @@ def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
     assert missing == []
 
 
-def test_the_pages_grid_is_one(file):
+def test_documented_grid_is_valid(file):
     block, _ = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
     cells = load_grid(file(block)).cells()
     assert len(cells) == 3 * 2 * 2 * 2 + 3 * 2 * 2
@@ -294,14 +294,14 @@ SET = '[collect]\ntask = "walker_walk"\nquality = "expert"\n[pretrain]\n'
         (SET + 'steps = "many"', "mine.toml: pretrain: .*--steps.*many"),
     ],
 )
-def test_a_setting_that_no_stage_takes_is_told_with_its_place(file, section, message):
+def test_invalid_settings_name_their_section(file, section, message):
     path = file(section)
     with pytest.raises(UserError, match=message):
         check_cells(load_grid(path).cells(), "mine.toml")
 
 
-def test_the_protocols_layers_are_what_its_page_says():
-    """Its commands make every policy once, on a set of the seed's own; its table counts them."""
+def test_protocol_page_matches_its_grid():
+    """The page's commands train every policy once, with one dataset per seed; its table counts them."""
     page = (ROOT / "results" / "protocol.md").read_text()
     cells = load_grid(str(ROOT / "results" / "protocol.toml")).cells()
     commands = re.findall(r"--only (.*(?:\n    .*)?)", page)
@@ -315,6 +315,6 @@ def test_the_protocols_layers_are_what_its_page_says():
         assert (collected["seed"], collected["episodes"]) == (100 + cell.seed, 100)
         played = policy["eval_episodes"], policy["eval_clean_episodes"]
         assert played == ((60, 30) if cell.value("task") == "walker_walk" else (40, 20))
-        assert policy["eval_every"] > policy["updates"], "at the end alone"
+        assert policy["eval_every"] > policy["updates"], "evaluation only at the end"
         assert cell.value("shift_shared") == (True if cell.value("method") == "acro" else None)
     assert [cell.seed for cell in layers[0]] == sorted(cell.seed for cell in layers[0])

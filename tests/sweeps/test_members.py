@@ -1,4 +1,4 @@
-"""Which runs are a grid's: by what they computed and on which sets, whoever made them."""
+"""Runs belong to a grid by their settings and datasets, wherever they were made."""
 
 import csv
 import re
@@ -43,7 +43,7 @@ def grid(tmp_path):
 
 @pytest.fixture
 def runs(grid):
-    """Fine-tunings as the grid's cells make them, on a set that was collected."""
+    """Fine-tuning runs of the grid's cells, on a collected dataset."""
     made = []
     for cell in load_grid(str(grid)).cells():
         labels = {name: cell.value(name) for name in ("method", "task", "quality", "corruption", "seed")}
@@ -64,31 +64,30 @@ def changed(run, **record):
     return replace(run, files=run.files | {"config": run.record | record})
 
 
-def test_runs_of_the_cells_settings_are_the_grids(grid, runs):
+def test_runs_with_settings_of_cells_are_members(grid, runs):
     assert members(grid, runs) == runs
     assert members(grid, runs, "seed=1", "pretrain.method=acro") == [runs[3]]
     with pytest.raises(UserError, match=r"^none of 4 runs is one of the 4 cells of grid that are asked for"):
         members(grid, runs, "pretrain.corruption=none")
 
 
-def test_the_set_is_told_by_how_it_was_collected(grid, runs):
+def test_members_match_datasets_by_collection(grid, runs):
     other = collection(CollectConfig(task="walker_walk", quality="expert", episodes=4, out=Path()))
     elsewhere = {"inputs": {"data": "elsewhere"}}
     twin = replace(runs[2], files=runs[2].files | {"encoder": {"pretrain": runs[2].card | {"data": "elsewhere"}}})
     own = [runs[0], changed(twin, **elsewhere)]
-    assert members(grid, [*own, changed(runs[1], collection=other), changed(runs[3], **elsewhere)]) == own, (
-        "of other content, but collected alike; collected otherwise; an encoder of another set"
-    )
+    # the second member has other content but an equal collection; the others differ in collection or encoder
+    assert members(grid, [*own, changed(runs[1], collection=other), changed(runs[3], **elsewhere)]) == own
 
 
-def test_a_set_that_nobody_collected_is_told_by_its_name(grid, runs):
+def test_uncollected_datasets_match_by_name(grid, runs):
     downloaded = [changed(run, collection={}) for run in runs]
     assert members(grid, downloaded) == downloaded
     with pytest.raises(UserError, match="none of 4 runs"):
         members(grid, downloaded, "collect.quality=medium")
 
 
-def test_the_offline_figures_page_counts_its_cells():
+def test_offline_page_counts_its_cells():
     cells = load_grid("offline").cells()
     own, control = read_results(RESULTS / "offline"), read_results(RESULTS / "control")
     found = GridMembers("offline", cells).among([*own, *control])
@@ -100,7 +99,7 @@ def test_the_offline_figures_page_counts_its_cells():
     assert (int(measured), int(asked)) == (len(found), len(cells))
 
 
-def test_a_method_of_ones_own_is_all_that_is_left_of_the_grid_that_the_page_shows(tmp_path):
+def test_committed_runs_cover_the_documented_grid_except_the_new_method(tmp_path):
     blocks = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
     (text,) = (block for block in blocks if "past_to_frame" in block)
     (tmp_path / "grid.toml").write_text(text.replace(', "past_to_frame"', ""))
@@ -109,7 +108,7 @@ def test_a_method_of_ones_own_is_all_that_is_left_of_the_grid_that_the_page_show
     assert len(GridMembers("grid", cells).among(kept)) == len(cells) == 12
 
 
-def test_only_what_the_grid_asks_for_is_missed(grid, runs, tmp_path):
+def test_missing_runs_are_those_of_the_grid(grid, runs, tmp_path):
     write_results(
         tmp_path / "rows", [run for run in runs if (run.labels["method"], run.labels["seed"]) != ("mik+a", 1)]
     )
@@ -123,7 +122,7 @@ def test_only_what_the_grid_asks_for_is_missed(grid, runs, tmp_path):
     assert not (tmp_path / "report" / "missing.csv").exists()
 
 
-def test_cells_of_which_nothing_is_there_are_missed_where_their_setting_is_reported(grid, runs, tmp_path):
+def test_cells_without_runs_are_missing_in_reported_settings(grid, runs, tmp_path):
     (one,) = (run for run in runs if (run.labels["method"], run.labels["seed"]) == ("acro", 0))
     write_results(tmp_path / "rows", [one])
     grid.write_text(GRID.replace('"expert"', '["expert", "medium"]'))
@@ -139,7 +138,7 @@ def test_cells_of_which_nothing_is_there_are_missed_where_their_setting_is_repor
         }  # fmt: skip
 
 
-def test_variants_are_missed_where_the_grid_has_them(grid, runs, tmp_path):
+def test_missing_variants_follow_the_grid(grid, runs, tmp_path):
     write_results(tmp_path / "rows", [run for run in runs if run.labels["method"] == "acro"])
     block = '[[block]]\nseed = {}\npretrain = {{ method = "acro", history = "{}", corruption = "{}" }}\n'
     blocks = [("[0, 1, 2]", "method", "patch"), ("[1, 2]", "gru", "patch"), ("[0]", "gru", "none")]
@@ -150,23 +149,23 @@ def test_variants_are_missed_where_the_grid_has_them(grid, runs, tmp_path):
     assert missed == {("patch", "", "2"), ("patch", "history gru", "1"), ("patch", "history gru", "2")}
 
 
-def test_sets_with_noise_of_ones_own_are_missed_by_the_name_that_their_files_tell(grid, runs, tmp_path):
+def test_noise_option_appears_in_the_quality_of_missing_runs(grid, runs, tmp_path):
     grid.write_text(GRID.replace('quality = "expert"', 'quality = "random"\naction_noise = 0.4'))
     asked = GridMembers("grid", load_grid(str(grid)).cells())
     assert {row["quality"] for row in asked.wanted} == {"random_noise0.4"}
 
 
-def test_a_report_is_about_the_cells_that_are_asked_for(grid, runs, tmp_path, capsys):
+def test_report_is_restricted_to_selected_cells(grid, runs, tmp_path, capsys):
     write_results(tmp_path / "rows", runs)
     words = ["report", str(tmp_path / "rows"), "--out", str(tmp_path / "report")]
     main([*words, "--grid", str(grid), "--only", "method=acro"])
     assert [run.labels["method"] for run in read_results(tmp_path / "report")] == ["acro", "acro"]
     capsys.readouterr()
-    for flags, told in (
+    for flags, message in (
         (["--only", "method=acro"], "--only and --change apply to the cells of a grid: add --grid"),
         (["--grid", "navigation"], "navigation: its cells are mazes; `vd4rl-pomdp navigation report` reports them"),
     ):
         with pytest.raises(SystemExit) as end:
             main([*words, *flags])
         assert end.value.code == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err

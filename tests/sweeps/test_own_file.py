@@ -1,4 +1,4 @@
-"""Parts from a file of one's own, which the jobs of a sweep that it starts are started from, too."""
+"""Plug-ins registered in a user's script that starts a sweep are available in its jobs."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from finetune.algorithms import ALGORITHMS
 from finetune.algorithms.bc import BC
 
 class Mine(BC):
-    summary = "one's own"
+    summary = "a user's algorithm"
 
 ALGORITHMS.register("mine", Mine)
 """
@@ -40,7 +40,7 @@ eval_episodes = 1
 
 @pytest.fixture
 def run(tmp_path):
-    """Runs the file with some words in a folder with a grid and its set."""
+    """Run the script in a folder with a grid and its dataset."""
     write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25, 30])
     (tmp_path / "grid.toml").write_text(GRID)
     (tmp_path / "folder").mkdir()
@@ -54,28 +54,28 @@ def run(tmp_path):
     return command
 
 
-def test_jobs_know_the_parts_of_the_file_that_a_sweep_was_started_from(tmp_path, run):
+def test_sweep_jobs_load_plugins_of_the_starting_script(tmp_path, run):
     shown = run(GUARD + "main()", "-m", "folder.own", words="sweep run grid.toml --out x --data data --dry-run").stdout
     assert "\npython -m folder.own finetune " in shown
     assert run(GUARD + "main()").stdout == "all 3 jobs are finished\n"
     (record,) = (tmp_path / "runs").rglob("finetune-mine/config.json")
-    told = json.loads(record.read_text())
-    assert told["plugins"] == {"algorithm mine": "registered by a call"}
-    assert told["command"].startswith("own.py finetune ")
+    config = json.loads(record.read_text())
+    assert config["plugins"] == {"algorithm mine": "registered by a call"}
+    assert config["command"].startswith("own.py finetune ")
     again = run("# changed\n" + GUARD + "main()")
     assert (
         "warning: algorithm mine: 1 sets or runs count, though its code has changed since they began\n" in again.stderr
     )
 
 
-def test_a_file_that_starts_its_sweep_whatever_its_words_starts_none_in_a_job(run):
+def test_job_that_would_start_a_sweep_fails(run):
     done = run(GUARD + "main('sweep run grid.toml --out runs --data data --only algorithm=mine'.split())")
     assert done.returncode == 1
     assert "a job cannot start a sweep: end the file in `main()`, which reads the job's own command line" in done.stderr
 
 
-def test_a_part_that_no_file_tells_of_is_refused_before_anything_runs(tmp_path, run, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))  # a notebook's has no file
+def test_plugin_without_file_is_rejected(tmp_path, run, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))  # as in a notebook, without a file
     with ALGORITHMS.isolated():
         ALGORITHMS.register("mine", BC)
         with pytest.raises(SystemExit) as end:

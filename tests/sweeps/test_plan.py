@@ -1,4 +1,4 @@
-"""Jobs and what is finished: by what runs computed, on which data, wherever they lie."""
+"""Planning of jobs: finished runs are matched by what they computed and on which data, in any folder."""
 
 import re
 import shutil
@@ -46,7 +46,7 @@ finetune = { random_histories = 0.5, algorithm = ["td3_bc", "bc"] }
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
-    """A folder in which the grid's jobs have been carried out, on a set that nothing here collected."""
+    """A folder with the finished jobs of the grid, on a dataset without collection record."""
     out = tmp_path_factory.mktemp("swept")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VD4RL_POMDP_CACHE", str(out / ".cache"))
@@ -66,12 +66,12 @@ def copy(swept, tmp_path, monkeypatch):
 
 
 def plan(folder: Path, changes=(), kept=(), data=None, others=(), out=None):
-    """Jobs of a folder's grid, in the folder itself unless `out` names another."""
+    """Jobs of a folder's grid, planned in `out` or the folder itself."""
     return planned(folder, changes, kept, data, others, out)[0]
 
 
 def planned(folder: Path, changes=(), kept=(), data=None, others=(), out=None):
-    """Jobs and warnings, likewise."""
+    """Jobs and warnings, as `plan`."""
     cells, out = load_grid(str(folder / "grid.toml"), changes).cells(), out or folder
     return plan_jobs(cells, out, data or out / DATA, kept, others)
 
@@ -80,7 +80,7 @@ def left(jobs):
     return [job.name for job in jobs if not job.finished]
 
 
-def test_what_was_run_is_finished_whatever_its_parts(swept):
+def test_completed_runs_are_finished_jobs(swept):
     jobs = plan(swept)
     assert left(jobs) == []
     assert [job.name.removeprefix("walker_walk/expert/patch/") for job in jobs] == [
@@ -95,7 +95,7 @@ def test_what_was_run_is_finished_whatever_its_parts(swept):
     ]
 
 
-def test_a_run_is_found_by_what_it_computed_and_resumes_where_it_lies(copy):
+def test_moved_runs_are_found_by_recipe_and_resumed_in_place(copy):
     (copy / "walker_walk" / "expert" / "patch" / "acro").rename(copy / "elsewhere")
     jobs = plan(copy)
     assert left(jobs) == []
@@ -107,15 +107,15 @@ def test_a_run_is_found_by_what_it_computed_and_resumes_where_it_lies(copy):
     assert (job.folder, job.begun) == (folder, True)
 
 
-def test_a_name_that_another_run_has_is_left_to_it(copy):
+def test_folder_names_of_other_runs_are_not_reused(copy):
     names = left(plan(copy, ["finetune.updates=20"]))
     assert len(names) == 4
     assert all("~" in name for name in names)
     assert left(plan(copy)) == []
 
 
-def test_a_name_that_another_grid_has_planned_is_left_to_it(tmp_path, capsys):
-    """Of neither grid anything has begun."""
+def test_folder_names_planned_by_another_grid_are_not_reused(tmp_path, capsys):
+    """No run of either grid has begun."""
     folder = SweepFolder(tmp_path)
     (tmp_path / "grid.toml").write_text(GRID)
     first, second = plan(tmp_path, ["finetune.updates=30"]), ["--change", "finetune.updates=40", "--out", str(tmp_path)]
@@ -127,14 +127,14 @@ def test_a_name_that_another_grid_has_planned_is_left_to_it(tmp_path, capsys):
     assert sum("~" in name for name in named) == len(first) - len(shared)
     assert {job.name for job in first} & named == shared
     assert folder.jobs_of_others("first") == []
-    assert plan(tmp_path, ["finetune.updates=30"], others=first) == first, "a job of both is one"
+    assert plan(tmp_path, ["finetune.updates=30"], others=first) == first, "jobs of both grids are shared"
 
 
-def test_settings_that_are_too_many_for_a_folders_name_are_told_by_a_hash(tmp_path):
+def test_long_folder_names_are_replaced_by_a_hash(tmp_path):
     many = {name: 2 for name in ("batch_size", "hidden_dim", "views", "shift", "eval_every", "log_every", "n_step")}
     many |= {"checkpoint_every": 2, "eval_length": 2, "updates": 2, "learning_rate": 0.01, "alpha": 0.5, "gamma": 0.5}
-    told = ", ".join(f"{name} = {value}" for name, value in many.items())
-    blocks = [f"[[block]]\nfinetune = {{ {told}, eval_episodes = {episodes} }}\n" for episodes in (3, 4)]
+    settings = ", ".join(f"{name} = {value}" for name, value in many.items())
+    blocks = [f"[[block]]\nfinetune = {{ {settings}, eval_episodes = {episodes} }}\n" for episodes in (3, 4)]
     first = GRID.partition("[finetune]")[0] + 'method = "acro"\n'
     (tmp_path / "grid.toml").write_text(first + "".join(blocks))
     names = [Path(job.name).name for job in plan(tmp_path) if job.section == "finetune"]
@@ -142,7 +142,7 @@ def test_settings_that_are_too_many_for_a_folders_name_are_told_by_a_hash(tmp_pa
     assert all(re.fullmatch(r"finetune-td3_bc,[0-9a-f]{24}", name) for name in names)
 
 
-def test_runs_on_every_further_content_of_a_set_have_folders_of_their_own(copy):
+def test_runs_on_new_dataset_contents_get_new_folders(copy):
     folders = set()
     for length in (31, 32):
         shutil.rmtree(copy / "data" / "walker_walk")
@@ -155,41 +155,41 @@ def test_runs_on_every_further_content_of_a_set_have_folders_of_their_own(copy):
         assert job.name not in left(plan(copy)), "it is found again"
 
 
-def test_a_policy_whose_encoder_saw_another_set_is_not_a_grids(copy):
+def test_policy_with_encoder_of_another_dataset_is_not_finished(copy):
     folder = copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0"
     shutil.rmtree(folder / "pretrain")
     card = folder / "finetune-td3_bc" / "encoder" / "config.json"
-    told = read_json(card)
-    write_json(card, told | {"pretrain": told["pretrain"] | {"data": "another"}})
+    content = read_json(card)
+    write_json(card, content | {"pretrain": content["pretrain"] | {"data": "another"}})
     assert [name.split("/")[-1].split("~")[0] for name in left(plan(copy))] == ["pretrain", "finetune-td3_bc"]
 
 
-def test_an_encoder_is_trained_once_for_all_its_policies_and_not_missed_when_they_are_finished(copy):
+def test_encoder_is_shared_and_not_needed_after_its_policies(copy):
     assert not any("pretrain" in name for name in left(plan(copy, ["finetune.algorithm=td3_bc,bc"])))
     shutil.rmtree(copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0" / "pretrain")
     assert left(plan(copy)) == []
     assert len(left(plan(copy, ["seed=0,1"]))) == 7
 
 
-def test_rows_that_were_kept_are_finished_runs_and_a_changed_part_is_told(copy, tmp_path, monkeypatch):
+def test_kept_rows_count_as_finished_and_changed_code_is_reported(copy, tmp_path, monkeypatch):
     main(["results", "add", *map(str, sorted(copy.rglob("finetune-*"))), "--out", str(tmp_path / "rows")])
     kept, new = runs_kept([tmp_path / "rows"]), tmp_path / "new"
     shutil.copytree(copy / "data", new / "data")
     assert len(left(plan(copy, out=new))) == 7
     assert left(plan(copy, kept=kept, out=new)) == []
-    assert len(left(plan(copy, ["seed=0,1"], kept=kept, out=new))) == 7, "the other seed's"
+    assert len(left(plan(copy, ["seed=0,1"], kept=kept, out=new))) == 7, "jobs of the other seed"
     monkeypatch.setattr(module, "of_other_code", lambda record, settings: ["method mine"])
     jobs, warnings = planned(copy, kept=kept, out=new)
     assert left(jobs) == []
-    number = len(kept) + 1  # and their set
+    number = len(kept) + 1  # including their dataset
     assert warnings == [f"method mine: {number} sets or runs count, though its code has changed since they began"]
 
 
-def test_policies_on_an_encoder_that_was_made_anew_count_and_are_told(copy):
+def test_policies_on_a_replaced_encoder_are_reported(copy):
     assert planned(copy)[1] == []
     config = next(copy.rglob("pretrain/encoder/config.json"))
-    told = read_json(config)
-    write_json(config, told | {"pretrain": told["pretrain"] | {"seed": 7}})
+    content = read_json(config)
+    write_json(config, content | {"pretrain": content["pretrain"] | {"seed": 7}})
     jobs, warnings = planned(copy)
     assert left(jobs) == []
     number = len(list(config.parents[2].glob("finetune-*/config.json")))
@@ -198,7 +198,7 @@ def test_policies_on_an_encoder_that_was_made_anew_count_and_are_told(copy):
     assert planned(copy)[1] == []
 
 
-def test_an_encoder_that_is_asked_for_and_needed_is_made(copy, tmp_path):
+def test_requested_or_needed_encoders_are_trained(copy, tmp_path):
     blocks = ["[[block]]\n", "[[block]]\nfinetune = { updates = 7 }\n"]
     head = GRID.partition("[finetune]")[0] + 'method = "acro"\n'
     (copy / "grid.toml").write_text(head + "".join(blocks[::-1]))
@@ -214,17 +214,17 @@ def test_an_encoder_that_is_asked_for_and_needed_is_made(copy, tmp_path):
         path.parent for path in copy.rglob("pretrain/config.json") if read_json(path)["config"]["method"] == "acro"
     ]
     main(["results", "add", *map(str, pretrained), "--out", str(tmp_path / "encoders")])
-    assert stages(None) == stages(tmp_path / "encoders") == {"pretrain", "finetune"}, "a row is no encoder"
+    assert stages(None) == stages(tmp_path / "encoders") == {"pretrain", "finetune"}, "a row has no encoder weights"
     (job,) = (job for job in plan(copy) if job.section == "finetune")
     main(list(job.words))
     main(["results", "add", str(job.folder), "--out", str(tmp_path / "policies")])
-    assert stages(tmp_path / "policies") == {"pretrain"}, "it was asked for"
+    assert stages(tmp_path / "policies") == {"pretrain"}, "the encoder was requested"
     main(["results", "add", *map(str, pretrained), "--out", str(tmp_path / "policies")])
     assert stages(tmp_path / "policies") == set()
 
 
-def tell_collection(folder: Path) -> None:
-    """Write into every run how its set was collected."""
+def record_collection(folder: Path) -> None:
+    """Write into every run how its dataset was collected."""
     for config in folder.rglob("config.json"):
         if "stage" in (record := read_json(config)):
             collection = {"task": "walker_walk", "quality": "expert", "episodes": 200, "seed": 0, "render": "fast"}
@@ -232,9 +232,9 @@ def tell_collection(folder: Path) -> None:
             write_json(config, record | {"collection": collection})
 
 
-def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_path):
-    """Which another row on the same content may tell."""
-    tell_collection(copy)
+def test_kept_rows_without_dataset_match_by_collection(copy, tmp_path):
+    """Another row on the same content may record the collection."""
+    record_collection(copy)
     early = next(copy.rglob("finetune-td3_bc/config.json"))
     write_json(early, {name: value for name, value in read_json(early).items() if name != "collection"})
     main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
@@ -243,21 +243,21 @@ def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_pat
     assert len(left(plan(copy, ["collect.episodes=100"], kept=kept, out=tmp_path / "new"))) == 8
 
 
-@pytest.mark.parametrize(("lengths", "told"), [([20, 25, 31], True), ([20, 25, 30], False)])
-def test_kept_rows_of_a_set_collected_alike_with_other_content_are_told(copy, tmp_path, capsys, lengths, told):
-    tell_collection(copy)
+@pytest.mark.parametrize(("lengths", "warned"), [([20, 25, 31], True), ([20, 25, 30], False)])
+def test_kept_rows_of_other_dataset_content_are_reported(copy, tmp_path, capsys, lengths, warned):
+    record_collection(copy)
     rows, new = tmp_path / "rows", tmp_path / "new"
     main(["results", "add", str(copy), "--out", str(rows)])
     write_fake_set(new / "data" / "walker_walk" / "expert", lengths)
     main(["sweep", "run", str(copy / "grid.toml"), "--out", str(new), "--done", str(rows), "--dry-run"])
     shown = capsys.readouterr()
     warning = "warning: walker_walk/expert: 4 kept runs are of a set collected alike, but with other content"
-    assert (warning in shown.err) == told
-    assert f"{1 if told else 5} done" in shown.out
+    assert (warning in shown.err) == warned
+    assert f"{1 if warned else 5} done" in shown.out
 
 
 def collected(**settings):
-    """A collection.json."""
+    """Content of a collection.json."""
     return collection(CollectConfig(task="walker_walk", quality="expert", out=Path("-"), **settings)) | {
         "actors": ["x"]
     }
@@ -275,35 +275,35 @@ def collected(**settings):
         ({"frame_size": 48}, "collect.seed=0", "a dataset of frame_size 48, the grid says the default frame_size"),
     ],
 )
-def test_a_set_that_was_collected_otherwise_is_refused(copy, stored, asked, message):
+def test_dataset_with_other_collection_settings_is_rejected(copy, stored, asked, message):
     write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(**stored))
     with pytest.raises(UserError, match=message):
         plan(copy, [asked])
 
 
 @pytest.mark.parametrize("size", [48, 84])
-def test_a_set_that_was_collected_so_is_taken(copy, size):
+def test_dataset_with_requested_collection_settings_is_accepted(copy, size):
     write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(frame_size=size, episodes=3))
     (copy / "data" / "walker_walk" / "expert" / "provenance.json").write_text("{}")
     assert left(plan(copy, [f"collect.frame_size={size}", "collect.episodes=3"])) == []
 
 
-def test_a_set_of_ones_own_has_frames_of_the_size_that_is_asked_for(copy):
+def test_uncollected_dataset_of_other_frame_size_is_rejected(copy):
     with pytest.raises(UserError, match=r"expert: holds frames of 84x84 pixels, the grid says 48; choose another"):
         plan(copy, ["collect.frame_size=48"])
 
 
-def test_a_longer_task_is_evaluated_over_all_of_it(tmp_path):
+def test_evaluation_length_follows_the_task(tmp_path):
     (tmp_path / "grid.toml").write_text(GRID.replace("walker_walk", "long"))
     with TASKS.isolated():
         TASKS.register("long", replace(TASKS["walker_walk"], decisions=700))
         cell = load_grid(str(tmp_path / "grid.toml"), []).cells()[0]
-        assert recorded(cell, "finetune")["eval_length"] == 5, "as the preset says"
+        assert recorded(cell, "finetune")["eval_length"] == 5, "from the preset"
         usual = load_grid(str(tmp_path / "grid.toml"), ["finetune.eval_length=500"]).cells()[0]
         assert recorded(usual, "finetune")["eval_length"] == 700
 
 
-def test_a_seed_may_have_a_set_of_its_own(copy, tmp_path):
+def test_seeds_may_have_individual_datasets(copy, tmp_path):
     wheres = [f'[[where]]\nonly = ["seed={seed}"]\ncollect = {{ seed = {100 + seed} }}\n' for seed in (0, 1)]
     (copy / "grid.toml").write_text(GRID.replace("seed = 0", "seed = [0, 1]") + "".join(wheres))
     jobs = [job for job in plan(copy, out=tmp_path / "out") if "/acro/" in job.name or "data/" in job.name]
@@ -318,14 +318,14 @@ def test_a_seed_may_have_a_set_of_its_own(copy, tmp_path):
     collected = [job.words[job.words.index("--seed") + 1] for job in jobs if job.section == "collect"]
     assert collected == ["100", "101"]
     cells = load_grid(str(copy / "grid.toml")).cells()
-    for collected, number in ((100, 4), (101, 0)):  # seed 0's policies count on the set of seed 0 alone
+    for collected, number in ((100, 4), (101, 0)):  # policies of seed 0 count only on the dataset of seed 0
         wanted = {"collection": collection_of(cells[0]) | {"seed": collected}}
         kept = [replace(run, files=run.files | {"config": run.record | wanted}) for run in runs_below(copy)]
         done = [job for job in plan(copy, kept=kept, out=tmp_path / "out") if job.done]
         assert ({job.section for job in done}, len(done)) == ({"finetune"} if number else set(), number)
 
 
-def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
+def test_downloaded_dataset_is_found_in_its_size_folder(copy, tmp_path):
     shutil.move(copy / "data" / "walker_walk" / "expert", tmp_path / "set")
     shutil.move(tmp_path / "set", copy / "data" / "walker_walk" / "expert" / "84px")
     jobs = plan(copy)
@@ -333,17 +333,17 @@ def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
     assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
 
 
-def test_the_grid_of_published_files_takes_downloaded_sets(tmp_path, capsys, own_cache):
+def test_vd4rl_grid_uses_downloaded_datasets(tmp_path, capsys, own_cache):
     for task in ("walker_walk", "cheetah_run"):
         for quality in ("medium_expert", "expert"):
             write_fake_set(tmp_path / "vd4rl" / task / quality / "84px", [20, 25])
     main(["sweep", "run", "vd4rl", "--data", str(tmp_path / "vd4rl"), "--out", str(tmp_path / "out"), "--dry-run"])
     shown = capsys.readouterr().out
     assert "data collect" not in shown
-    assert f"{4 * 6 * 5 * 2 + 4} jobs, 4 done" in shown, "6 encoders and policies a seed and set, and the sets"
+    assert f"{4 * 6 * 5 * 2 + 4} jobs, 4 done" in shown, "6 encoders and policies per seed and dataset, 4 datasets"
 
 
-def test_a_run_that_added_other_images_is_another(tmp_path):
+def test_runs_with_other_exogenous_images_do_not_match(tmp_path):
     class AnySet:
         def made(self, record):
             return True
@@ -359,9 +359,7 @@ def test_a_run_that_added_other_images_is_another(tmp_path):
 
 
 @pytest.mark.parametrize(("quality", "name"), [('"mine"', "mine"), ("2", "2")])
-def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_the_grids(
-    tmp_path, capsys, own_cache, quality, name
-):
+def test_user_defined_quality_is_used_if_present(tmp_path, capsys, own_cache, quality, name):
     text = GRID.partition("[finetune]")[0].replace('"expert"', quality) + "method = 'random'"
     (tmp_path / "grid.toml").write_text(text)
     words = [str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]
@@ -377,7 +375,7 @@ def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_t
     assert GridMembers("grid", cells).among([run]) == [run]
 
 
-def test_a_set_of_another_task_is_refused(tmp_path):
+def test_dataset_of_another_task_is_rejected(tmp_path):
     (tmp_path / "grid.toml").write_text(GRID)
     write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25])
     shard = min((tmp_path / "data" / "walker_walk" / "expert").glob("*.hdf5"))

@@ -1,4 +1,4 @@
-"""Which fine-tunings one process trains together, and that each of them stays a job of its own: with real processes."""
+"""Stacks of fine-tuning jobs in one process, each with its own attempts, log and run; with real processes."""
 
 import os
 from dataclasses import asdict, replace
@@ -25,7 +25,7 @@ def sweep(out, *jobs, at_once=1, stack=3, **options):
 
 
 def together(jobs):
-    """Names of the jobs by the processes that began them, each with its jobs in the order in which it began them."""
+    """Job names grouped by process, in the order in which they began."""
     seen = sorted((one["time"], one["process"], job.name) for job in jobs for one in begun(job))
     processes = {}
     for _, process, name in seen:
@@ -40,10 +40,10 @@ def encoder(folder, **config):
     write_json(folder / "config.json", asdict(record))
 
 
-def test_jobs_stack_that_differ_in_seed_encoder_data_and_folder_alone(tmp_path):
+def test_stackable_jobs_differ_only_in_seed_encoder_data_and_folder(tmp_path):
     a, b, c = (policy(tmp_path, name) for name in "abc")
-    told = {"a": "--seed 0 --data x", "b": "--seed 1 --data y --view-seed 0", "c": "--seed 2 --data x"}
-    a, b, c = jobs = [replace(one, words=[*one.words, *told[one.name].split()]) for one in (a, b, c)]
+    flags = {"a": "--seed 0 --data x", "b": "--seed 1 --data y --view-seed 0", "c": "--seed 2 --data x"}
+    a, b, c = jobs = [replace(one, words=[*one.words, *flags[one.name].split()]) for one in (a, b, c)]
     assert in_stacks(jobs, 5, {}) == [jobs]
     assert in_stacks(jobs, 2, {}) == [[a, b], [c]]
     assert in_stacks(jobs, 1, {}) == [[a], [b], [c]]
@@ -51,7 +51,7 @@ def test_jobs_stack_that_differ_in_seed_encoder_data_and_folder_alone(tmp_path):
     assert words_of_stack([a, b]) == words
     other = replace(b, words=[*b.words, "--hidden-dim", "8"])
     assert in_stacks([a, other, c], 5, {}) == [[a, c], [other]]
-    for settings in ({"algorithm": "bc"}, {"task": "cheetah_run"}):  # which the encoder decides, not the command
+    for settings in ({"algorithm": "bc"}, {"task": "cheetah_run"}):  # determined by the encoder, not the command
         assert in_stacks([a, replace(b, settings=settings), c], 5, {}) == [[a, c], [replace(b, settings=settings)]]
     pixels = [replace(one, settings={"views": "0"}) for one in jobs]
     assert in_stacks(pixels, 5, {}) == [[one] for one in pixels]
@@ -59,7 +59,7 @@ def test_jobs_stack_that_differ_in_seed_encoder_data_and_folder_alone(tmp_path):
     assert in_stacks(encoders, 5, {}) == [[one] for one in encoders]
 
 
-def test_the_width_of_what_a_policy_reads_is_known_without_its_weights(tmp_path):
+def test_policy_input_width_is_read_from_encoder_config(tmp_path):
     one = policy(tmp_path, "one", "before")
     assert width_of(one, tmp_path) is None
     encoder(tmp_path / "before" / "encoder", feature_dim=50, history="gru", hidden_dim=64)
@@ -70,7 +70,7 @@ def test_the_width_of_what_a_policy_reads_is_known_without_its_weights(tmp_path)
     assert width_of(other, tmp_path) == 64
 
 
-def test_a_stack_is_of_one_width_and_every_job_keeps_its_row_and_its_log(tmp_path):
+def test_stacks_share_a_width_and_jobs_keep_rows_and_logs(tmp_path):
     encoders = [replace(job(tmp_path, name), done=True) for name in ("x", "y", "z")]
     for one, width in zip(encoders, (64, 50, 64), strict=True):
         encoder(one.folder / "encoder", feature_dim=width)
@@ -87,7 +87,7 @@ def test_a_stack_is_of_one_width_and_every_job_keeps_its_row_and_its_log(tmp_pat
     assert (logs / "of_z.log").read_text() == f"in one process with of_x: see {logs / 'of_x.log'}\n"
 
 
-def test_a_stack_has_the_places_of_its_jobs_as_far_as_nothing_else_needs_them(tmp_path, monkeypatch):
+def test_stack_uses_cores_that_no_other_job_needs(tmp_path, monkeypatch):
     monkeypatch.setattr(driver, "places", lambda _: [driver.Place((core,), None) for core in cores])
     cores = sorted(os.sched_getaffinity(0))[:2]
     jobs = [policy(tmp_path, name) for name in "abc"]
@@ -99,7 +99,7 @@ def test_a_stack_has_the_places_of_its_jobs_as_far_as_nothing_else_needs_them(tm
 
 
 @pytest.mark.parametrize("end", [2, "kill", "defect"])
-def test_what_a_stack_could_not_do_is_done_alone_by_whoever_comes(tmp_path, end):
+def test_failed_stack_continues_as_single_jobs(tmp_path, end):
     a, b, c, d = jobs = [policy(tmp_path, name, ends=(end, 2) if name == "b" else ()) for name in "abcd"]
     assert not sweep(tmp_path, *jobs, stack=4)
     assert together(jobs) == [["a", "b"], ["b"], ["c"], ["d"]]
@@ -107,19 +107,19 @@ def test_what_a_stack_could_not_do_is_done_alone_by_whoever_comes(tmp_path, end)
     assert (causes(tmp_path, a), causes(tmp_path, b)[1:]) == (["done"], ["failed"])
     first = causes(tmp_path, b)[0]
     assert (causes(tmp_path, c), causes(tmp_path, d)) == ([first, "done"],) * 2
-    assert not sweep(tmp_path, *jobs, stack=4), "a failure of its own is one"
+    assert not sweep(tmp_path, *jobs, stack=4), "b stays failed"
     main(["sweep", "retry", str(tmp_path), "--stack", "4"])
     assert [len(begun(one)) for one in jobs] == [1, 3, 1, 1]
 
 
-def test_what_passes_is_tried_again_as_a_stack(tmp_path):
+def test_temporary_failures_are_retried_as_a_stack(tmp_path):
     jobs = [policy(tmp_path, name, ends=(TEMPORARY,) if name == "a" else ()) for name in "ab"]
     assert sweep(tmp_path, *jobs)
     assert together(jobs) == [["a"], ["a", "b"]]
 
 
-def test_a_stack_waits_for_what_is_about_to_fill_it_and_for_nothing_else(tmp_path):
-    """With places for two, the first encoder's policies wait for the second encoder's, and not for a later one's."""
+def test_stack_waits_only_for_running_dependencies(tmp_path):
+    """With two slots, policies of the first encoder wait for those of the second, not for those of a later one."""
     encoders = [job(tmp_path, "x"), job(tmp_path, "y", ends=("wait",)), job(tmp_path, "z", "never")]
     never = job(tmp_path, "never", ends=(2,))
     one, two, other = jobs = [
@@ -135,7 +135,7 @@ def test_a_stack_waits_for_what_is_about_to_fill_it_and_for_nothing_else(tmp_pat
     assert together([one, two]) == [["one", "two"]]
 
 
-def test_interrupted_stacks_resume_and_what_was_finished_is_done(tmp_path):
+def test_interrupted_stack_resumes_its_unfinished_jobs(tmp_path):
     jobs = [policy(tmp_path, name, ends=("wait",) if name == "b" else ()) for name in "abc"]
     keep_plan(tmp_path, *jobs)
     process = command("retry", tmp_path, "--stack", "3")
@@ -147,7 +147,7 @@ def test_interrupted_stacks_resume_and_what_was_finished_is_done(tmp_path):
     assert together(jobs) == [["a", "b"], ["b", "c"]]
 
 
-def test_another_drivers_job_is_left_out_of_a_stack_and_drivers_share_what_is_left(tmp_path):
+def test_drivers_share_jobs_and_skip_those_in_use(tmp_path):
     jobs = [policy(tmp_path, name) for name in "abcdef"]
     keep_plan(tmp_path, *jobs)
     with owned(jobs[1].folder):
@@ -172,7 +172,7 @@ eval_clean = false
 """
 
 
-def test_a_grids_policies_are_trained_as_a_stack_and_each_is_a_run_of_its_own(tmp_path, monkeypatch, capsys):
+def test_grid_policies_train_as_stack_with_separate_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     write_fake_set(tmp_path / "out" / "data" / "walker_walk" / "expert", [20, 25])
     (tmp_path / "grid.toml").write_text(GRID)
@@ -187,4 +187,4 @@ def test_a_grids_policies_are_trained_as_a_stack_and_each_is_a_run_of_its_own(tm
     assert [(row["cause"], row["stack"]) for one in policies for row in rows[one.name]] == [("done", 2)] * 2
     assert [read_run(one.folder).labels["seed"] for one in policies] == [0, 1]
     main([*words[:-2], "--dry-run"])
-    assert capsys.readouterr().out.endswith("# 5 jobs, 5 done, 0 to do\n"), "what is done alone or in a stack"
+    assert capsys.readouterr().out.endswith("# 5 jobs, 5 done, 0 to do\n"), "stacked runs count without --stack"

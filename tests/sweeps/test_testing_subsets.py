@@ -1,4 +1,4 @@
-"""Cells of the shipped grids' testing subsets, carried out as a user would: collected, trained, evaluated."""
+"""Cells of the shipped grids' testing subsets, from collection to evaluation."""
 
 import pytest
 
@@ -14,10 +14,10 @@ from vd4rl_pomdp.runs.results import read_run
         ("quick_navigation", ["method=no_history"], 2, "three_curtains/no_history/seed0"),
     ],
 )
-def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, grid, only, jobs, last):
+def test_testing_cell_runs_end_to_end(tmp_path, monkeypatch, capsys, grid, only, jobs, last):
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     words = ["sweep", "run", grid, "--testing", "--only", *only, "--out", str(tmp_path / "out")]
-    main([*words, "--jobs", "2"])  # a thread each: two of one job wait long for each other beside other tests
+    main([*words, "--jobs", "2"])  # one thread per job: two threads stall when tests run in parallel
     assert f"all {jobs} jobs are finished" in capsys.readouterr().out
     assert read_json(tmp_path / "out" / last / "timing.json")["seconds"] > 0
     if grid == "quick":
@@ -26,6 +26,6 @@ def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, g
         main(["navigation", "report", str(tmp_path / "out"), "--out", str(tmp_path / "report"), "--no-pictures"])
         assert (tmp_path / "report" / "tables.csv").is_file()
         main([*words[:-1], str(tmp_path / "elsewhere"), "--done", str(tmp_path / "report"), "--dry-run"])
-        assert f"{last}: done" in capsys.readouterr().out, "a grid goes on from the report's rows"
+        assert f"{last}: done" in capsys.readouterr().out, "a sweep continues from the report's rows"
     main(["sweep", "status", str(tmp_path / "out")])
     assert f"{jobs} jobs: {jobs} done" in capsys.readouterr().out
