@@ -1,4 +1,4 @@
-"""Every command has help, a slip is one line and exit code 2, and every other end has its own code."""
+"""The command line: help, one-line messages for invalid input, and exit codes."""
 
 import multiprocessing
 import os
@@ -62,20 +62,20 @@ SLIPS = [
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_help_and_its_group_a_list(name, capsys):
+def test_commands_and_groups_have_help(name, capsys):
     with pytest.raises(SystemExit) as end:
         main([*name.split(), "--help"])
     assert end.value.code in (0, None)
     shown = capsys.readouterr().out
     assert name in shown
-    assert "Args:" not in shown, "each flag shows its own text"
+    assert "Args:" not in shown, "flags show only their own text"
     for words in ([], name.split()[: 0 if name.startswith("report") else -1]):
         main(words)
         assert COMMANDS[name][1] in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("words", "message"), SLIPS)
-def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):
+def test_invalid_command_lines_print_one_line(words, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(SystemExit) as end:
@@ -88,7 +88,7 @@ def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
     assert [p.name for p in tmp_path.iterdir()] == ["file"], "nothing may be left behind"
 
 
-def test_a_tilde_behind_an_equals_sign_is_the_users_folder(tmp_path, monkeypatch, capsys):
+def test_tilde_after_equals_sign_is_expanded(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("HOME", str(tmp_path))
     with pytest.raises(SystemExit):
         main(["pretrain", "--out=~/run", "--data=~/set"])
@@ -111,20 +111,20 @@ def raised(kind: type[BaseException], *words: object):
         (raised(OSError, 28, "No space left", "a"), 75, "error: a: the disk is full: free some space and re-run"),
     ],
 )
-def test_every_end_has_a_code_and_a_line(act, code, line, monkeypatch):
+def test_exit_codes_and_messages(act, code, line, monkeypatch):
     monkeypatch.setattr(stages, "list_parts", act)
     end = run_to_end(["list"])
     assert end.code == code
     assert end.line.startswith(line)
 
 
-def test_a_defect_is_raised(monkeypatch):
+def test_defects_are_raised(monkeypatch):
     monkeypatch.setattr(stages, "list_parts", raised(AttributeError, "a defect"))
     with pytest.raises(AttributeError, match="a defect"):
         run_to_end(["list"])
 
 
-def test_a_file_that_calls_main_while_a_worker_imports_it_is_told_where_to_put_that(monkeypatch, capsys):
+def test_unguarded_main_call_in_a_worker_is_rejected(monkeypatch, capsys):
     monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
     with pytest.raises(SystemExit) as end:
         main(["list"])
@@ -132,7 +132,7 @@ def test_a_file_that_calls_main_while_a_worker_imports_it_is_told_where_to_put_t
     assert 'call main() below `if __name__ == "__main__":`' in capsys.readouterr().err
 
 
-def test_the_list_of_commands_needs_neither_numpy_nor_torch_and_a_reader_may_go():
+def test_help_imports_no_torch_and_survives_a_closed_pipe():
     code = (
         "import runpy, sys; sys.argv = ['x', '--help']; runpy.run_module('vd4rl_pomdp', run_name='__main__');"
         "sys.exit(bool({'numpy', 'torch', 'triton'} & set(sys.modules)))"
@@ -146,7 +146,7 @@ def test_the_list_of_commands_needs_neither_numpy_nor_torch_and_a_reader_may_go(
     assert (process.communicate()[1], process.returncode) == (b"", 141)
 
 
-def test_a_missing_extra_ends_in_one_line_that_names_it(tmp_path):
+def test_missing_extra_is_named(tmp_path):
     words = ["navigation", "collect", "--maze", "no_curtain", "--preset", "smoke", "--workers", "1", "--out", "x"]
     code = (
         "import sys; sys.modules['gymnasium_robotics'] = None; from vd4rl_pomdp.cli import main\n"
@@ -158,14 +158,14 @@ def test_a_missing_extra_ends_in_one_line_that_names_it(tmp_path):
     assert "`pip install '.[navigation]'`" in done.stderr
 
 
-def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():
+def test_messages_are_escaped_on_ascii_terminals():
     line, environment = [sys.executable, "-m", "vd4rl_pomdp"], os.environ | {"PYTHONIOENCODING": "ascii"}
     refused = subprocess.run([*line, "data", "check", "ζ"], capture_output=True, env=environment)
     assert (refused.returncode, refused.stderr.count(b"\n")) == (2, 1)
     assert refused.stderr.startswith(b"error: \\u03b6: no such folder")
 
 
-def test_results_stay_on_one_line_each(capsys):
+def test_printed_results_take_one_line_each(capsys):
     show(
         {"shards": [f"{i}.hdf5" for i in range(100)], "dtypes": {"reward": ["float64"]}, "seconds": 0.123456789}, False
     )
@@ -177,7 +177,7 @@ def test_results_stay_on_one_line_each(capsys):
     ]
 
 
-def test_every_part_has_a_line_that_says_what_it_is_and_where_it_comes_from(capsys, monkeypatch):
+def test_list_describes_every_plugin_and_its_origin(capsys, monkeypatch):
     class Mine(BC):
         """My own algorithm.
 

@@ -19,7 +19,7 @@ LABELS |= {"algorithm": "td3_bc", "seed": 0}
 
 
 def write_returns(jobs):
-    """Rows of two evaluations."""
+    """Write rows of two evaluations for every fine-tuning job."""
     for job, method in zip((job for job in jobs if job.section == "finetune"), METHODS, strict=True):
         rows = [
             LABELS
@@ -46,7 +46,7 @@ def write_navigation(jobs):
 
 
 @pytest.mark.parametrize("preset", ["cpu", "smoke"])
-def test_the_demo_uses_every_stage(tmp_path, preset):
+def test_demo_uses_every_stage(tmp_path, preset):
     words = [job.words for job in demo_jobs(tmp_path, preset)]
     stages = ["data", *["pretrain", "finetune"] * 3, *["navigation"] * 3]
     assert [stage[0] for stage in words] == stages
@@ -55,13 +55,13 @@ def test_the_demo_uses_every_stage(tmp_path, preset):
     assert all(stage[stage.index("--preset") + 1] == preset for stage in words if "--preset" in stage)
 
 
-def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_path, monkeypatch, capsys):
+def test_demo_ends_with_report_conclusion_and_film(tmp_path, monkeypatch, capsys):
     carried, commands, played = [], [], []
     monkeypatch.setattr(demos, "report", lambda words, program: commands.append(words))
     monkeypatch.setattr(demos, "play", lambda words, program: played.append(words))
 
     def carry_out(plans, folder, kind, options):
-        assert folder.plans() == plans, "`sweep status` knows them"
+        assert folder.plans() == plans, "plans are stored for `sweep status`"
         (jobs,) = (plan.jobs for plan in plans)
         carried.append((kind, options.jobs))
         write_returns(jobs)
@@ -74,19 +74,19 @@ def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_pat
     assert set(PAIR) <= set(shipped())
     assert commands == [[str(tmp_path / "demo" / "runs"), "--out", str(tmp_path / "demo" / "report")]]
     shown = capsys.readouterr()
-    told = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
-    assert Counter(told) == {"data": 1, "pretrain": 3, "finetune": 3, "navigation": 3, "report": 1}
+    printed = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
+    assert Counter(printed) == {"data": 1, "pretrain": 3, "finetune": 3, "navigation": 3, "report": 1}
     out = [" ".join(line.split()) for line in shown.out.splitlines()]
     start = next(number for number, line in enumerate(out) if line.startswith(f"Under {LABELS['corruption']}, errors"))
     lines = [f"{method} 39, 54 120 ± 20 (n = 2)" for method in METHODS]
-    assert out[start + 3 : start + 6] == lines, "of the last evaluation, and how sure it is"
+    assert out[start + 3 : start + 6] == lines, "means of the last evaluation with standard errors"
     assert out[start + 6].startswith("One seed each")
-    assert {"mik+a 7", "no_history 80"} <= set(out), "errors behind the curtains"
+    assert {"mik+a 7", "no_history 80"} <= set(out), "navigation errors"
     with Image.open(tmp_path / "demo" / "navigation.gif") as film:
         assert film.n_frames == 60
 
 
-def test_without_a_gpu_the_demo_does_a_job_a_core_up_to_four(tmp_path, monkeypatch):
+def test_demo_runs_one_job_per_core_up_to_four(tmp_path, monkeypatch):
     at_once = []
 
     def carry_out(plans, folder, kind, options):

@@ -1,4 +1,4 @@
-"""Devices, precision, and memory that is lent."""
+"""Devices, precision and frame buffers."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from vd4rl_pomdp.nn.heads import ExactLinear
 CPU = torch.device("cpu")
 
 
-def test_products_are_in_bf16_but_for_those_that_leave_autocast():
+def test_autocast_uses_bf16_except_for_exact_layers():
     head, x = ExactLinear(64, 3), torch.rand(5, 64)
     with autocast(CPU, "bf16"):
         assert (x @ x.T).dtype == torch.bfloat16
@@ -20,16 +20,16 @@ def test_products_are_in_bf16_but_for_those_that_leave_autocast():
         assert (x @ x.T).dtype == torch.float32
 
 
-@pytest.mark.parametrize(("name", "told"), [("gpu", "unknown device 'gpu'"), ("cuda:99", "no such GPU is visible")])
-def test_a_device_that_is_not_there_is_refused(name, told):
+@pytest.mark.parametrize(("name", "message"), [("gpu", "unknown device 'gpu'"), ("cuda:99", "no such GPU is visible")])
+def test_missing_device_is_rejected(name, message):
     assert pick_device("cpu") == CPU
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         pick_device(name)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(("precision", "error"), [("fp32", (0, 1e-5)), ("tf32", (1e-5, 1e-2))])
-def test_products_on_a_gpu_have_the_precision_that_is_set(precision, error):
+def test_gpu_matrix_products_have_the_set_precision(precision, error):
     g = torch.Generator().manual_seed(0)
     a, b = torch.randn(512, 512, generator=g), torch.randn(512, 512, generator=g)
     truth = (a.double() @ b.double()).float()
@@ -40,14 +40,14 @@ def test_products_on_a_gpu_have_the_precision_that_is_set(precision, error):
     assert error[0] <= off <= error[1]
 
 
-def test_tf32_on_a_cpu_is_fp32():
+def test_tf32_has_no_effect_on_cpu():
     assert not autocast(CPU, "tf32")._enabled
     before = torch.get_float32_matmul_precision()
     set_products(CPU, "tf32")
     assert torch.get_float32_matmul_precision() == before
 
 
-def test_memory_is_lent_again_only_when_no_tensor_uses_it():
+def test_buffers_are_reused_only_when_unreferenced():
     buffers = FrameBuffers()
     first = buffers.take((2, 3, 84, 84))
     address = first.data_ptr()
@@ -58,13 +58,13 @@ def test_memory_is_lent_again_only_when_no_tensor_uses_it():
     assert address in {tensor.data_ptr() for tensor in [buffers.take((2, 3, 84, 84)) for _ in range(2)]}
 
 
-def test_a_batch_of_another_size_gets_its_own_memory():
+def test_buffers_have_the_requested_shape():
     buffers = FrameBuffers()
     shapes = [tuple(buffers.take((count, 3, 84, 84)).shape) for count in (3, 1, 2, 3, 0, 5, 4)]
     assert shapes == [(count, 3, 84, 84) for count in (3, 1, 2, 3, 0, 5, 4)]
 
 
-def test_many_living_batches_never_share_memory():
+def test_live_buffers_do_not_share_memory():
     buffers = FrameBuffers()
     held = [buffers.take((1, 3, 84, 84)).fill_(i) for i in range(9)]
     assert [int(tensor.float().mean()) for tensor in held] == list(range(9))

@@ -1,4 +1,4 @@
-"""A damaged file is a sentence: nothing waits on a pipe, nothing recurses, no wrong type goes on."""
+"""Damaged and special files raise a UserError: no blocking on pipes, no recursion errors, no wrong types."""
 
 import os
 
@@ -17,7 +17,7 @@ from vd4rl_pomdp.runs.metrics import read_metrics
 NESTED = "[" * 100_000 + "]" * 100_000
 
 
-def test_pipes_folders_and_devices_are_no_files(tmp_path):
+def test_pipes_folders_and_devices_are_rejected(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, type(tmp_path)("/dev/zero")):
         with pytest.raises(UserError, match="not a regular file"):
@@ -27,7 +27,7 @@ def test_pipes_folders_and_devices_are_no_files(tmp_path):
     assert regular(tmp_path / "missing") == tmp_path / "missing"
 
 
-def test_deep_nesting_is_no_recursion(tmp_path):
+def test_deeply_nested_json_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="nested too deeply"):
         parse_json(NESTED)
     (tmp_path / "a.json").write_text(NESTED)
@@ -38,7 +38,7 @@ def test_deep_nesting_is_no_recursion(tmp_path):
 CARD = {"method": "acro", "task": "t", "quality": "q", "corruption": {}, "seed": 0, "steps": 1, "preset": "smoke"}
 
 
-def test_values_have_the_declared_types():
+def test_values_must_have_declared_types():
     assert build(EncoderCard, CARD | {"action_loss": 1}).action_loss == 1
     assert build(EncoderCard, CARD).action_loss is None
     for wrong in ({"seed": "0"}, {"seed": True}, {"corruption": []}, {"action_loss": "x"}, {"task": None}):
@@ -49,14 +49,14 @@ def test_values_have_the_declared_types():
 
 
 @pytest.mark.parametrize("line", ["[]", '{"loss": 1.0}', '{"step": "1"}', NESTED, "nonsense"], ids=range(5))
-def test_a_damaged_line_of_metrics_is_named(tmp_path, line):
+def test_damaged_metrics_line_is_rejected(tmp_path, line):
     (tmp_path / "metrics.jsonl").write_text(f'{{"step": 1, "loss": 0.5}}\n{line}\n')
     with pytest.raises(UserError, match=r"metrics\.jsonl: a line is not JSON of numbers"):
         read_metrics(tmp_path / "metrics.jsonl")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_tensors_that_are_not_finite_are_refused(tmp_path, value):
+def test_non_finite_tensors_are_rejected(tmp_path, value):
     save_file({"good": torch.arange(3), "bad": torch.tensor([1.0, value])}, tmp_path / "a.safetensors")
     with pytest.raises(UserError, match="'bad' is not finite"):
         read_tensors(tmp_path / "a.safetensors")

@@ -1,4 +1,4 @@
-"""Parts of one's own, by call and by entry point; what an installed package breaks, breaks nothing else."""
+"""Plug-ins registered by call and by entry point; a broken package affects nothing else."""
 
 from hashlib import sha256
 from importlib.metadata import EntryPoint, entry_points
@@ -29,13 +29,13 @@ def offer(monkeypatch, **values: str) -> None:
     monkeypatch.setattr(vd4rl_pomdp.core.registry, "entry_points", lambda group: entries)
 
 
-def test_all_kinds_have_a_registry():
+def test_methods_are_registered():
     import pretrain.objectives
 
     assert REGISTRIES["method"] is pretrain.objectives.METHODS
 
 
-def test_a_call_adds_a_part_and_after_a_block_it_is_forgotten(registry):
+def test_register_within_isolated_block(registry):
     with registry.isolated():
         registry.register("mine", "my own")
         assert registry.named("mine") == registry["mine"] == "my own"
@@ -47,7 +47,7 @@ def test_a_call_adds_a_part_and_after_a_block_it_is_forgotten(registry):
 
 
 @pytest.mark.parametrize(
-    ("name", "part", "told"),
+    ("name", "part", "message"),
     [
         ("own", "mine", "a frame encoder called 'own' exists already"),
         ("three", 3, "frame encoder 'three' is a int, not a string"),
@@ -58,22 +58,22 @@ def test_a_call_adds_a_part_and_after_a_block_it_is_forgotten(registry):
         ),
     ],
 )
-def test_what_cannot_be_a_part_is_refused_however_it_comes(registry, monkeypatch, capsys, name, part, told):
-    with pytest.raises(UserError, match=told):
+def test_invalid_plugins_are_rejected(registry, monkeypatch, capsys, name, part, message):
+    with pytest.raises(UserError, match=message):
         registry.register(name, part, replace=True)
     monkeypatch.setattr("tests.core.test_registry.THEIRS", part)
     offer(monkeypatch, **{name: "tests.core.test_registry:THEIRS"})
     assert list(registry) == ["own", "own+a"]
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_an_unknown_name_is_told_the_choices(registry):
-    told = "unknown frame encoder 'owl': choose one of own, own\\+a, or run or import the file that registers it"
-    with pytest.raises(UserError, match=told):
+def test_unknown_name_lists_the_choices(registry):
+    message = "unknown frame encoder 'owl': choose one of own, own\\+a, or run or import the file that registers it"
+    with pytest.raises(UserError, match=message):
         registry.named("owl")
 
 
-def test_an_entry_point_offers_a_part_once_asked_for_and_its_package_is_its_origin(registry, monkeypatch):
+def test_entry_points_are_loaded_on_demand(registry, monkeypatch):
     script = next(e for e in entry_points(group="console_scripts") if e.dist.name == "pytest")
     offered = EntryPoint("theirs", "tests.core.test_registry:THEIRS", registry.group)._for(script.dist)
     monkeypatch.setattr(vd4rl_pomdp.core.registry, "entry_points", lambda group: [offered])
@@ -93,7 +93,7 @@ def test_an_entry_point_offers_a_part_once_asked_for_and_its_package_is_its_orig
         ("tests.core.test_registry:PAGE", "is a int, not a string"),
     ],
 )
-def test_a_part_that_cannot_be_loaded_is_named_once_and_left_out(registry, monkeypatch, capsys, value, reason):
+def test_broken_entry_point_warns_once(registry, monkeypatch, capsys, value, reason):
     offer(monkeypatch, broken=value, theirs="tests.core.test_registry:THEIRS")
     assert registry.named("own") == "ours"
     assert registry.named("theirs") == "theirs"
@@ -104,9 +104,7 @@ def test_a_part_that_cannot_be_loaded_is_named_once_and_left_out(registry, monke
         registry.named("broken")
 
 
-def test_a_record_names_the_parts_that_are_not_ours_and_another_file_or_package_is_told(
-    registry, monkeypatch, tmp_path
-):
+def test_record_names_plugins_and_detects_changed_code(registry, monkeypatch, tmp_path):
     offer(monkeypatch, theirs="tests.core.test_registry:THEIRS")
     file = tmp_path / "mine.py"
     file.write_text("registry.register('mine', 'my own')\n")

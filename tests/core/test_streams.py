@@ -1,4 +1,4 @@
-"""Streams of random numbers: one name, one stream; no two of them meet, and none is computed by arithmetic."""
+"""Named random streams: hashed seeds that do not collide."""
 
 from pathlib import Path
 
@@ -19,19 +19,19 @@ NAMES = [
 ]
 
 
-def test_no_two_streams_meet_over_names_and_seeds():
+def test_streams_of_names_and_seeds_are_distinct():
     seeds = {stream_seed(seed, *name) for seed in range(50) for name in NAMES}
     assert len(seeds) == 50 * len(NAMES)
     assert all(0 <= seed < 2**63 for seed in seeds)
 
 
-def test_streams_are_the_same_on_every_machine_and_a_number_is_not_its_digits():
+def test_stream_seeds_are_platform_independent():
     assert stream_seed(0, "pretrain", "batches") == 8177399787921554125
     assert stream_seed(7, "corruption", "finetune", 3) == 4266965685318587072
     assert stream_seed(0, "corruption", 1) != stream_seed(0, "corruption", "1")
 
 
-def test_generators_and_networks_begin_at_their_streams():
+def test_generators_and_networks_are_seeded_by_stream():
     drawn = [torch.randint(2**60, (4,), generator=stream_generator(3, "a")).tolist() for _ in range(2)]
     assert drawn[0] == drawn[1]
     weights = []
@@ -42,12 +42,12 @@ def test_generators_and_networks_begin_at_their_streams():
 
 
 @pytest.mark.parametrize("name", [("curl", "shift"), ("driml", "k"), ("homer", "imposters")])
-def test_an_objectives_own_draws_are_not_those_of_the_corruption(name):
+def test_objective_draws_differ_from_corruption_draws(name):
     corruption = BatchCorruption(CorruptionConfig.of("patch"), 0, "pretrain")
     assert not set(Draws(0, *name).keys(64).tolist()) & set(corruption.keys(torch.arange(64)).tolist())
 
 
-def test_a_row_looks_the_same_to_all_stages_under_emission_alone():
+def test_only_emission_corrupts_rows_equally_in_all_stages():
     rows = torch.arange(16)
     for mode, same in (("emission", True), ("resample", False)):
         stages = [

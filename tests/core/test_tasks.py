@@ -1,4 +1,4 @@
-"""Tasks of one's own: what is found from their models, and what is refused."""
+"""User-defined tasks: layouts derived from their models, replay, and invalid tasks."""
 
 import re
 import subprocess
@@ -18,14 +18,14 @@ from vd4rl_pomdp.envs.make import layout_of, make_env
 from vd4rl_pomdp.envs.rendering import mujoco, suite
 
 
-def test_tasks_are_named_without_loading_a_simulator():
+def test_task_registry_loads_no_simulator():
     code = "import sys, vd4rl_pomdp.core.tasks; print({'mujoco', 'gymnasium', 'torch'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
+def test_benchmark_layouts_match_their_models(name):
     task = TASKS[name]
     assert layout_of(replace(task, layout=None)) == task.layout
 
@@ -33,14 +33,14 @@ def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
 @pytest.mark.parametrize(
     ("domain", "task", "layout"),
     [
-        ("cartpole", "swingup", Layout(1, 5, 2, turning=(1,))),  # its camera stands still and shows where the cart is
+        ("cartpole", "swingup", Layout(1, 5, 2, turning=(1,))),  # fixed camera: the cart's position is visible
         ("hopper", "hop", Layout(4, 15, 7, travel=(0,), turning=(2,))),
         ("quadruped", "run", Layout(12, 78, 23, travel=(0, 1), quaternions=(3,))),
         ("reacher", "easy", Layout(2, 6, 2, turning=(0,))),
         ("ball_in_cup", "catch", Layout(2, 8, 4)),
     ],
 )
-def test_what_a_task_does_not_tell_is_found(domain, task, layout):
+def test_layouts_are_derived_from_models(domain, task, layout):
     found = layout_of(DMCTask(domain, task))
     assert found == layout
     physics = suite.load(domain, task).physics.get_state()
@@ -48,7 +48,7 @@ def test_what_a_task_does_not_tell_is_found(domain, task, layout):
     assert found.visible_state(physics[None]).shape == (1, width)
 
 
-def test_where_a_ball_is_shows_beside_the_body_that_a_camera_follows():
+def test_layout_keeps_ball_position_relative_to_camera():
     task = DMCTask("quadruped", "fetch")
     layout, physics = layout_of(task), suite.load(task.domain, task.task).physics.get_state()[None]
     assert (layout.travel, layout.beside) == ((0, 1), (23,))
@@ -61,12 +61,12 @@ def test_where_a_ball_is_shows_beside_the_body_that_a_camera_follows():
     assert sorted(moved[np.abs(moved) > 1e-5].round(4).tolist()) == [-2, 3]
 
 
-def test_a_camera_that_follows_a_hand_shows_where_things_are():
+def test_camera_on_a_hand_keeps_absolute_positions():
     layout = layout_of(DMCTask("stacker", "stack_2", camera=1))
     assert (layout.travel, layout.beside) == ((), ())
 
 
-def test_actions_of_a_task_with_other_bounds_reach_all_of_them():
+def test_actions_are_scaled_to_the_tasks_bounds():
     env = make_env(DMCTask("quadruped", "walk"), size=None)
     spec = env.simulator.action_spec()
     assert (spec.maximum != 1).any()
@@ -77,7 +77,7 @@ def test_actions_of_a_task_with_other_bounds_reach_all_of_them():
 
 
 def _alike(layout: Layout, physics: np.ndarray) -> np.ndarray:
-    """Another simulator state of the same look."""
+    """Another simulator state with the same appearance."""
     other = physics.copy()
     other[list(layout.turning)] += [2 * np.pi * (-1) ** i for i in range(len(layout.turning))]
     for first in layout.quaternions:
@@ -86,7 +86,7 @@ def _alike(layout: Layout, physics: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", [*TASKS, "quadruped walk", "acrobot swingup"])
-def test_states_that_look_the_same_are_the_same_vector_and_others_are_not(name):
+def test_visible_states_are_equal_iff_frames_are(name):
     task = TASKS[name] if name in TASKS else DMCTask(*name.split())
     env, rng = make_env(task, size=48), np.random.default_rng(0)
     env.reset(1)
@@ -104,7 +104,7 @@ def test_states_that_look_the_same_are_the_same_vector_and_others_are_not(name):
     assert np.abs(env.layout.visible_state(turned) - env.layout.visible_state(step.physics)).max() > 0.01
 
 
-def test_the_two_columns_of_a_quaternion_are_those_of_its_rotation_matrix():
+def test_quaternion_pose_is_two_columns_of_its_rotation_matrix():
     quaternion, matrix = np.random.default_rng(0).normal(size=4), np.zeros(9)
     quaternion /= np.linalg.norm(quaternion)
     mujoco.mju_quat2Mat(matrix, quaternion)
@@ -113,7 +113,7 @@ def test_the_two_columns_of_a_quaternion_are_those_of_its_rotation_matrix():
 
 
 @pytest.mark.parametrize("task", ["cartpole swingup", "acrobot swingup", "dog walk", "quadruped fetch"])
-def test_rewards_of_any_task_of_dm_control_replay(task):
+def test_dm_control_rewards_replay(task):
     env, rng = make_env(DMCTask(*task.split()), size=None), np.random.default_rng(0)
     first = env.reset(3)
     actions = rng.uniform(-1, 1, (8, env.action_dim)).astype(np.float32)
@@ -125,7 +125,7 @@ def test_rewards_of_any_task_of_dm_control_replay(task):
 
 
 @pytest.mark.parametrize("task", ["reacher easy", "finger turn_hard", "swimmer swimmer6"])
-def test_a_task_that_draws_a_target_into_its_model_cannot_be_replayed_and_says_so(task, tmp_path):
+def test_tasks_with_random_models_are_reported_as_not_replayable(task, tmp_path):
     with TASKS.isolated():
         TASKS.register("mine", DMCTask(*task.split()))
         collect(CollectConfig("mine", "random", tmp_path / "set", episodes=1, workers=1, frame_size=16), 2)
@@ -134,7 +134,7 @@ def test_a_task_that_draws_a_target_into_its_model_cannot_be_replayed_and_says_s
     assert report["replay"] == "impossible: mine draws more than the simulator state for each episode"
 
 
-def test_an_unknown_task_of_dm_control_is_one_line():
+def test_unknown_dm_control_task_lists_the_choices():
     with pytest.raises(UserError, match=r"dm_control has no task 'cartpole', 'swing': choose one of .*swingup"):
         layout_of(DMCTask("cartpole", "swing"))
     with pytest.raises(UserError, match=r"choose one of acrobot, .*walker"):
@@ -153,27 +153,27 @@ def test_an_unknown_task_of_dm_control_is_one_line():
         ({"score_divisor": np.nan}, "its score_divisor is nan: it must be a positive number"),
     ],
 )
-def test_numbers_that_make_no_task_are_not_registered(numbers, message):
+def test_invalid_task_numbers_are_rejected(numbers, message):
     for task in (DMCTask("cartpole", "swingup", **numbers), GymnasiumTask("CartPole-v1", **numbers)):
         with TASKS.isolated(), pytest.raises(UserError, match=message):
             TASKS.register("mine", task)
 
 
 @pytest.mark.parametrize("camera", [-1, 9])
-def test_a_camera_that_a_model_has_not_is_one_line(camera):
+def test_missing_camera_is_rejected(camera):
     message = f"dm_control's walker walk has no camera {camera}: register the task with one of 0 to 1"
     for layout in (None, TASKS["walker_walk"].layout):
         with pytest.raises(UserError, match=message):
             make_env(DMCTask("walker", "walk", camera, layout=layout))
 
 
-def test_a_length_that_is_refused_is_the_tasks_own_where_none_is_told():
+def test_too_short_episodes_are_rejected():
     with pytest.raises(UserError, match="an episode of 0 decisions is too short"):
         make_env(DMCTask("walker", "walk", decisions=0))
 
 
-class Unpaid(gymnasium.Env):
-    """Pays a number in its first step alone."""
+class OddRewardEnv(gymnasium.Env):
+    """Returns a valid reward in its first step and `paid` afterwards."""
 
     def __init__(self, paid, render_mode=None):
         self.paid, self.render_mode, self.steps = paid, render_mode, 0
@@ -192,33 +192,33 @@ class Unpaid(gymnasium.Env):
 
 
 @pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf, None, "much", np.ones(2)])
-def test_a_reward_that_is_no_number_is_refused_in_the_step_that_pays_it(paid):
-    env = make_env(GymnasiumTask(Unpaid, {"paid": paid}))
+def test_non_numeric_reward_is_rejected(paid):
+    env = make_env(GymnasiumTask(OddRewardEnv, {"paid": paid}))
     env.reset(0)
     assert env.step(np.zeros(2, np.float32)).reward == 1
     with pytest.raises(
-        UserError, match=rf"environment Unpaid returns the reward {re.escape(str(paid))}, expected a number"
+        UserError, match=rf"environment OddRewardEnv returns the reward {re.escape(str(paid))}, expected a number"
     ):
         env.step(np.zeros(2, np.float32))
 
 
 @pytest.mark.parametrize(
-    ("method", "given", "told"),
+    ("method", "given", "message"),
     [
         ("step", (np.zeros(1), 0.0, False, {}), "returns 4 values from step, expected 5 as in Gymnasium: wrap it"),
         ("reset", np.zeros(1), "returns a ndarray from reset, expected 2 as in Gymnasium: wrap it"),
     ],
 )
-def test_an_environment_of_another_interface_is_one_line(monkeypatch, method, given, told):
-    monkeypatch.setattr(Unpaid, method, lambda self, *words, **more: given)
-    env = make_env(GymnasiumTask(Unpaid, {"paid": 1.0}))
+def test_environment_of_another_interface_is_rejected(monkeypatch, method, given, message):
+    monkeypatch.setattr(OddRewardEnv, method, lambda self, *words, **more: given)
+    env = make_env(GymnasiumTask(OddRewardEnv, {"paid": 1.0}))
     if method == "step":
         env.reset(0)
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         env.step(np.zeros(2, np.float32)) if method == "step" else env.reset(0)
 
 
-def test_an_environment_that_does_not_exist_is_one_line():
+def test_missing_environment_is_rejected():
     for environment, arguments, reason in (
         ("NoSuchThing-v0", {}, "NoSuchThing"),
         ("no_such_module:Thing-v0", {}, "no_such_module"),
@@ -229,7 +229,7 @@ def test_an_environment_that_does_not_exist_is_one_line():
         assert "\n" not in str(caught.value)
 
 
-def test_tasks_with_other_arguments_are_other_tasks():
+def test_tasks_compare_by_arguments():
     one, other = (GymnasiumTask("CartPole-v1", {"sutton_barto_reward": value}) for value in (True, False))
     assert one != other
     assert len({one, other}) == 2

@@ -23,7 +23,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_name_stays_in_its_markdown_cell_and_marks_nothing_up(name):
+def test_markdown_is_escaped(name):
     for shown in (markdown(name), code(name)):
         assert len(shown.splitlines()) == 1
         assert not re.search(r"(?<!\\)\|", shown)
@@ -33,20 +33,20 @@ def test_a_name_stays_in_its_markdown_cell_and_marks_nothing_up(name):
     assert fence not in code(name)[len(fence) : -len(fence)]
 
 
-def test_ordinary_names_are_left_as_they_are():
+def test_ordinary_names_are_unchanged():
     for name in ("walker_walk", "mik+a", "llvmpipe (LLVM 19.1.7, 256 bits)", "torch 2.5.1+cpu, h5py 3.12", "f00ba4"):
         assert markdown(name) == plain(name) == name
     assert code("vd4rl-pomdp data collect") == "`vd4rl-pomdp data collect`"
 
 
-def test_no_line_ends_a_code_block():
+def test_code_block_fence_is_longer_than_its_content():
     lines = code_block(["x ```", "a\nb"], "bash")
     assert lines == ["````bash", "x ```", "a b", "````"]
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_name_is_drawn_as_it_is(name):
+def test_figure_text_is_escaped(name):
     figure = Figure()
     axes = figure.subplots()
     axes.plot([0], [0], label=plain(name, 30))
@@ -62,6 +62,6 @@ def test_long_names_are_wrapped():
     assert max(map(len, plain("x" * 100, 20).splitlines())) <= 20
 
 
-def test_what_utf8_cannot_hold_is_spelt_out(tmp_path):
+def test_surrogates_are_written_as_escapes(tmp_path):
     write_text(tmp_path / "page", "μ \udcff")
     assert (tmp_path / "page").read_bytes().decode() == "μ \\udcff"

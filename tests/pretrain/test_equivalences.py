@@ -1,4 +1,4 @@
-"""Objectives that must be equal are, to 1e-6: methods differ in what they claim to differ in, in nothing else."""
+"""Methods that coincide for some settings have equal outputs, to 1e-6."""
 
 import pytest
 import torch
@@ -14,33 +14,33 @@ def assert_same_logits(first: torch.nn.Module, second: torch.nn.Module) -> None:
     torch.testing.assert_close(found, second.action_logits(window)[real], atol=1e-6, rtol=1e-6)
 
 
-def test_acro_with_k_1_is_one_step_inverse():
+def test_acro_with_k_1_equals_one_step_inverse():
     assert_same_logits(build("acro", max_k=1), build("one_step_inverse"))
 
 
 @pytest.mark.parametrize("actions", ["", "+a"])
-def test_fj_whose_past_covers_the_window_is_ah(actions: str):
+def test_fj_with_past_covering_the_window_equals_ah(actions: str):
     assert_same_logits(build(f"fj{actions}", m=ROWS), build(f"ah{actions}"))
 
 
 @pytest.mark.parametrize("actions", ["", "+a"])
-def test_mik_with_a_past_of_m_rows_has_the_past_of_fj(actions: str):
+def test_mik_with_bounded_past_has_the_past_of_fj(actions: str):
     mik, fj = build(f"mik{actions}", m=2), build(f"fj{actions}", m=2)
     fj.encoder.load_state_dict(mik.encoder.state_dict())
     window = batch()
     torch.testing.assert_close(mik.representations(window)[0], fj.representations(window)[0], atol=1e-6, rtol=1e-6)
 
 
-def test_mik_with_a_long_future_is_mik():
+def test_mik_with_long_future_equals_mik():
     assert_same_logits(build("mik+a", n=ROWS), build("mik+a"))
 
 
-def test_no_history_is_acro():
+def test_no_history_equals_acro():
     assert_same_logits(build("acro"), build("no_history"))
 
 
-def test_a_gap_that_a_method_never_scores_is_logged_by_no_number():
-    """Zero would read as a gap whose action is given away."""
+def test_losses_of_unscored_gaps_are_not_logged():
+    """A logged zero would look like a gap whose action is visible."""
     objective = build("acro")
     every = objective.pairs(ROWS)
     objective.pairs = lambda rows: every[every[:, 1] % 2 == 0]

@@ -1,4 +1,4 @@
-"""Options belong to the parts that read them: what the chosen ones do not read is refused, so that no run claims it."""
+"""Options belong to the plug-ins that read them; options that no selected plug-in reads are rejected."""
 
 import pytest
 
@@ -28,13 +28,13 @@ from vd4rl_pomdp.studies.navigation.config import NavigationConfig
         ({"no_such_setting": 1}, "the method"),
     ],
 )
-def test_what_the_chosen_parts_do_not_read_is_refused(settings, reader):
+def test_unread_options_are_rejected(settings, reader):
     name = next(name for name in settings if name not in PretrainConfig.choosers or name == "action_target")
     with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by .*{reader}.*: leave it out"):
         PretrainConfig.of("smoke", **settings).check()
 
 
-def test_states_are_read_by_methods_that_predict_actions_and_by_the_floor():
+def test_state_frame_encoder_is_limited_to_some_methods():
     for method in ("mik+a", "acro", "random"):
         PretrainConfig.of("smoke", method=method, frame_encoder="state", hidden_share=0.5).check()
     for method in ("curl", "bc", "supervised"):
@@ -50,7 +50,7 @@ def test_states_are_read_by_methods_that_predict_actions_and_by_the_floor():
         {"method": "fj", "m": 3},
         {"method": "homer", "homer_codes": 8},
         {"method": "driml", "max_k": 2},
-        {"method": "curl", "window": 3},  # which is shorter than the default K of other methods
+        {"method": "curl", "window": 3},  # shorter than the default max_k of other methods
         {"method": "random", "steps": 7, "batch_size": 3, "corruption": "patch", "patch_size": 8},
         {"method": "bc", "feature_dim": 16},
         {"method": "supervised+a", "head_dim": 16, "m": 3, "gru_layers": 2, "frame_encoder": "drq"},
@@ -58,7 +58,7 @@ def test_states_are_read_by_methods_that_predict_actions_and_by_the_floor():
         {"corruption": "patch+zero_frames", "corruption_mode": "emission", "patch_shared": True, "zeroed_frames": 1},
     ],
 )
-def test_what_the_chosen_parts_read_is_taken(settings):
+def test_read_options_are_accepted(settings):
     config = PretrainConfig.of("smoke", **settings)
     config.check()
     assert flat(config) | settings == flat(config)
@@ -66,23 +66,23 @@ def test_what_the_chosen_parts_read_is_taken(settings):
 
 @pytest.mark.parametrize("preset", PretrainConfig.presets)
 @pytest.mark.parametrize("method", METHODS)
-def test_a_presets_own_defaults_are_never_refused(method, preset):
+def test_preset_defaults_are_valid_for_all_methods(method, preset):
     PretrainConfig.of(preset, method=method).check()
 
 
-def test_a_preset_decides_options_of_whatever_part_has_them():
+def test_presets_set_options_of_selected_plugins():
     smoke, paper = (PretrainConfig.of(preset, method="driml") for preset in ("smoke", "paper"))
     assert (smoke.options.max_k, paper.options.max_k) == (3, 2)
     assert set(PretrainConfig.presets["smoke"]) <= {*flat(PretrainConfig()), *option_names()}
 
 
 @pytest.mark.parametrize("kind", [PretrainConfig, NavigationConfig, FinetuneConfig])
-def test_an_unknown_preset_is_told_the_choices(kind):
+def test_unknown_preset_lists_the_choices(kind):
     with pytest.raises(UserError, match="unknown preset 'large': choose one of paper, cpu, smoke"):
         kind.of("large")
 
 
-def test_other_parts_keep_what_was_told_and_take_their_own_defaults():
+def test_altered_config_keeps_explicit_settings():
     config = PretrainConfig.of("smoke", method="mik+a", max_k=2, corruption="patch", patch_size=8, seed=3)
     other = config.altered(method="driml")
     assert other == PretrainConfig.of("smoke", method="driml", max_k=2, corruption="patch", patch_size=8, seed=3)
@@ -91,7 +91,7 @@ def test_other_parts_keep_what_was_told_and_take_their_own_defaults():
 
 
 @pytest.mark.parametrize(("max_k", "window"), [(8, 8), (31, 8)])
-def test_a_gap_beyond_the_window_is_refused(max_k, window):
+def test_max_k_beyond_the_window_is_rejected(max_k, window):
     with pytest.raises(UserError, match=f"--max-k {max_k} needs windows of more"):
         PretrainConfig.of("smoke", max_k=max_k, window=window).check()
 
@@ -106,7 +106,7 @@ def test_a_gap_beyond_the_window_is_refused(max_k, window):
         ({"method": "integrator", "history": "gru"}, "integrator implies its memory"),
     ],
 )
-def test_values_that_cannot_work_are_refused(settings, message):
+def test_invalid_option_values_are_rejected(settings, message):
     with pytest.raises(UserError, match=message):
         PretrainConfig.of("smoke", **settings).check()
 
@@ -120,23 +120,23 @@ def test_values_that_cannot_work_are_refused(settings, message):
         ({"history_window": 3}, "history-window"),
     ],
 )
-def test_what_a_navigation_run_does_not_read_is_refused(settings, flag):
+def test_navigation_rejects_unread_options(settings, flag):
     with pytest.raises(UserError, match=f"--{flag} is not read by"):
         NavigationConfig.of("smoke", **settings)
 
 
 @pytest.mark.parametrize("method", ["random", "supervised+a", "mik+a", "fj", "no_history"])
-def test_the_grids_settings_are_read(method):
+def test_navigation_accepts_grid_settings(method):
     NavigationConfig.of("smoke", method=method, max_k=15).check()
 
 
-def test_an_encoder_that_is_trained_brings_its_algorithm_and_has_no_views_and_no_memory():
-    told = FinetuneConfig.of("smoke", views=3, alpha=5.0, n_step=2)
-    trained = as_trained(told, "drqv2_bc", False, "walker_walk")
+def test_end_to_end_encoder_determines_algorithm_and_options():
+    config = FinetuneConfig.of("smoke", views=3, alpha=5.0, n_step=2)
+    trained = as_trained(config, "drqv2_bc", False, "walker_walk")
     assert trained == as_trained(
         FinetuneConfig.of("smoke", algorithm="drqv2_bc", views=0, alpha=5.0, n_step=2), "", False, "walker_walk"
     )
     assert trained.memory == NO_OPTIONS
-    assert not {"alpha", "n_step"} & flat(as_trained(told, "bc", False, "walker_walk")).keys(), (
-        "nothing that is not read"
+    assert not {"alpha", "n_step"} & flat(as_trained(config, "bc", False, "walker_walk")).keys(), (
+        "bc does not read them"
     )

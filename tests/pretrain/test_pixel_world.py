@@ -1,4 +1,4 @@
-"""Baselines on pictures whose state is known, trained as they are trained on V-D4RL: random shifts are on."""
+"""Baselines on images of known state, with random shifts as on V-D4RL."""
 
 import math
 
@@ -18,35 +18,35 @@ def ball(tmp_path_factory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def nothing(tmp_path_factory) -> Dataset:
-    """The same without the ball: all pictures are one."""
+    """The dataset without the ball: all images are equal."""
     return ball_world(tmp_path_factory.mktemp("nothing"), ball=False)
 
 
 @pytest.mark.parametrize("method", STEPS)
-def test_a_baseline_halves_the_untrained_encoders_error(ball: Dataset, method: str):
-    """Where the ball is, within so many steps of 64 pictures: at most half of the error of the encoder as it began."""
+def test_baselines_halve_the_error_of_an_untrained_encoder(ball: Dataset, method: str):
+    """Probe error of the ball's position after `STEPS` updates on 64 images each."""
     settings = {"acro": INVERSE, "one_step_inverse": {"action_target": "mse"}}.get(method, {})
     trainer = trainer_on(ball, method, **settings)
     untrained = position_error(trainer)
-    assert 45 < untrained < 65, "random convolutions tell something of it"
+    assert 45 < untrained < 65, "random convolutions are partly informative"
     for _ in range(STEPS[method]):
         trainer.update()
     assert position_error(trainer) < 0.5 * untrained
 
 
-def test_homer_leaves_chance_where_patches_hide_the_ball_now_and_then(ball: Dataset):
-    """Patches of the benchmark's share of a picture, 6 of 32 pixels wide."""
+def test_homer_learns_under_patches(ball: Dataset):
+    """Patches of 6 of 32 pixels cover the same share of the image as in the benchmark."""
     trainer = trainer_on(ball, "homer", corruption="patch", patch_size=6, batch_size=16)
     untrained = position_error(trainer)
     losses = [trainer.update()["loss"].item() for _ in range(160)]
-    assert sum(losses[:20]) / 20 > 0.97 * math.log(2), "it begins there"
+    assert sum(losses[:20]) / 20 > 0.97 * math.log(2), "training starts at chance"
     assert sum(losses[-20:]) / 20 < 0.9 * math.log(2)
     assert position_error(trainer) < 0.5 * untrained
 
 
 @pytest.mark.parametrize("method", ["curl", "driml", "homer"])
-def test_where_all_pictures_are_one_nothing_tells_the_positive(nothing: Dataset, method: str):
-    """Shifts that positives share and negatives do not would: the loss then falls without knowledge of the state."""
+def test_contrastive_losses_stay_at_chance_for_identical_images(nothing: Dataset, method: str):
+    """If positives shared a shift that negatives do not, the loss would fall without knowledge of the state."""
     trainer = trainer_on(nothing, method, batch_size=16)
     losses = [trainer.update()["loss"].item() for _ in range(100)]
     batch, rows = trainer.config.batch_size, trainer.config.window

@@ -1,4 +1,4 @@
-"""Every method's step, replayed, against the same step run: on a CPU a recorder plays the CUDA graph's part."""
+"""Replayed against eager steps of every method; on a CPU a recorder stands in for the CUDA graph."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def states(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def trained(folder: Path, method: str, steps: int, device: str = "cpu", noise: float = 0.0) -> tuple[Trainer, list]:
-    """A trainer after some steps, and its scalars, read at the end; `noise` changes the last bits of its weights."""
+    """A trainer after `steps`, and its scalars, read at the end; `noise` perturbs its initial weights."""
     config = PretrainConfig.of("smoke", method=method, data=folder, out=folder, corruption="patch+zero_frames")
     if "l2_states" in vars(config.options):
         config = config.altered(l2_states=0.1)
@@ -45,7 +45,7 @@ def trained(folder: Path, method: str, steps: int, device: str = "cpu", noise: f
 
 
 def assert_same(one: tuple[Trainer, list], other: tuple[Trainer, list], tolerance: float) -> None:
-    """Losses, weights, buffers, optimiser states and streams."""
+    """Assert equal losses, weights, buffers, optimiser states and streams."""
     assert len(one[1]) == len(other[1])
     for row, expected in zip(one[1], other[1], strict=True):
         assert row == pytest.approx(expected, rel=tolerance, abs=tolerance)
@@ -60,7 +60,7 @@ def assert_same(one: tuple[Trainer, list], other: tuple[Trainer, list], toleranc
 
 
 @pytest.mark.parametrize("method", TRAINED)
-def test_a_replayed_step_is_the_one_that_is_run(
+def test_replayed_pretraining_equals_eager_pretraining(
     states: Path, monkeypatch: pytest.MonkeyPatch, method: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     replays(monkeypatch, pretrain.train, capture=None)
@@ -73,10 +73,8 @@ def test_a_replayed_step_is_the_one_that_is_run(
 
 
 @pytest.mark.parametrize("method", ["mik+a", "curl", "driml"])
-def test_a_replayed_training_resumes_where_it_was_cut(
-    states: Path, monkeypatch: pytest.MonkeyPatch, method: str
-) -> None:
-    """From the state of one that is replayed or of one that is run."""
+def test_replayed_pretraining_resumes(states: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    """From the state of a replayed and of an eager training."""
     replays(monkeypatch, pretrain.train, capture=record)
     whole = trained(states, method, STEPS)
     for capture in (record, None):
@@ -104,10 +102,10 @@ def distance(one: tuple[Trainer, list], other: tuple[Trainer, list]) -> list[flo
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("method", TRAINED)
-def test_a_cuda_graph_is_as_close_as_rounding_brings_two_runs(
+def test_cuda_graph_deviates_only_by_rounding(
     states: Path, monkeypatch: pytest.MonkeyPatch, method: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two that are run differ in the last bits of their first weights, as with sums in another order."""
+    """The tolerance comes from two eager runs whose initial weights differ in the last bits."""
     with monkeypatch.context() as patch:
         patch.setenv(EAGER_VARIABLE, "1")
         run = trained(states, method, GPU_STEPS, "cuda")

@@ -1,4 +1,4 @@
-"""The supervised references: the loss alone is told the state of its own row, and what it learns is in the encoder."""
+"""Supervised references: only the loss sees states, and the learned encoder predicts them."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ METHOD_NAMES = ["supervised", "supervised+a", "supervised_picture", "integrator"
 
 @pytest.fixture
 def with_states(tmp_path) -> Dataset:
-    """A set whose states are random numbers, but for a pose and a velocity that never change."""
+    """A dataset with random states; one pose and one velocity coordinate are constant."""
     dataset = open_dataset(write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 20], physics_dim=18))
     dataset.physics = np.random.default_rng(0).normal(size=(40, 18)) * np.arange(1, 19) + 5
     dataset.physics[:, [3, 12]] = 2
@@ -47,9 +47,7 @@ def made(dataset: Dataset, tmp_path: Path, method: str, **changes: object) -> tu
 
 
 @pytest.mark.parametrize("name", [*METHOD_NAMES, "mik+a"])
-def test_windows_hold_the_states_of_their_own_rows_and_only_for_a_method_that_regresses_them(
-    with_states, tmp_path, name
-):
+def test_windows_contain_states_only_for_supervised_methods(with_states, tmp_path, name):
     assert [name for name, method in METHODS.items() if method.regresses_state] == METHOD_NAMES
     window = made(with_states, tmp_path, name)[1].sample()
     if name not in METHOD_NAMES:
@@ -61,23 +59,23 @@ def test_windows_hold_the_states_of_their_own_rows_and_only_for_a_method_that_re
 
 
 @pytest.mark.parametrize("name", METHOD_NAMES)
-def test_the_loss_depends_on_the_states_and_the_representation_does_not(name):
+def test_states_affect_the_loss_but_not_the_representation(name):
     objective, window = build(name), windows(name)
     assert isinstance(window, StateWindows)
-    told = window.replace(state=window.state.clone().requires_grad_())
-    z = objective.encoder.encode(told)
-    assert torch.autograd.grad(z.sum(), told.state, allow_unused=True, retain_graph=True) == (None,)
+    tracked = window.replace(state=window.state.clone().requires_grad_())
+    z = objective.encoder.encode(tracked)
+    assert torch.autograd.grad(z.sum(), tracked.state, allow_unused=True, retain_graph=True) == (None,)
     assert torch.equal(z, objective.encoder.encode(window.replace(state=torch.full_like(window.state, 9.0))))
-    (felt,) = torch.autograd.grad(objective.loss(told, 0.0)[0], told.state)
-    assert torch.equal(felt.abs().amax(-1) > 0, window.real), "every real row has a state, and padding has none"
+    (gradient,) = torch.autograd.grad(objective.loss(tracked, 0.0)[0], tracked.state)
+    assert torch.equal(gradient.abs().amax(-1) > 0, window.real), "the loss uses states of all real rows only"
 
 
-def test_the_promises_hold_for_other_frame_encoders_and_memories():
+def test_supervised_method_conforms_with_other_encoders():
     check_method("supervised+a", frame_encoder="small", m=2, gru_layers=2)
 
 
-def test_the_prediction_of_row_t_is_of_the_state_of_row_t():
-    """A change of the picture in row t changes how the states of rows t.. are predicted, and of none before."""
+def test_prediction_of_row_t_regresses_state_of_row_t():
+    """A changed image in row t changes the predictions of rows t and later, and of no earlier row."""
     objective, window = build("supervised"), windows("supervised", (ROWS,))
     dark = window.replace(obs=window.obs.clone())
     dark.obs[:, 3] = 0
@@ -89,7 +87,7 @@ def test_the_prediction_of_row_t_is_of_the_state_of_row_t():
     assert (errors(window) != errors(dark)).any(-1).tolist() == [[False] * 3 + [True] * 3]
 
 
-def test_a_head_that_predicts_the_mean_has_a_loss_of_one_whatever_the_units(with_states, tmp_path):
+def test_supervised_loss_of_the_mean_prediction_is_one(with_states, tmp_path):
     objective, batches = made(with_states, tmp_path, "supervised", window=20)
     torch.nn.init.zeros_(objective.head[-1].weight)
     torch.nn.init.zeros_(objective.head[-1].bias)
@@ -108,7 +106,7 @@ def test_a_head_that_predicts_the_mean_has_a_loss_of_one_whatever_the_units(with
     assert logs["loss"].item() == pytest.approx((8 * 10 + 8) / 16, rel=1e-3)
 
 
-def test_the_states_of_held_out_episodes_are_told_to_no_loss(tmp_path):
+def test_losses_ignore_states_of_held_out_episodes(tmp_path):
     dataset = open_dataset(write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [9] * 11, physics_dim=18))
     dataset.physics = np.random.default_rng(0).normal(size=(99, 18))
     for method in METHOD_NAMES:
@@ -117,13 +115,13 @@ def test_the_states_of_held_out_episodes_are_told_to_no_loss(tmp_path):
         held_out = (window.key >> 20) % 5 == 4
         assert 0 < held_out[:, 0].float().mean() < 1
         assert torch.equal(window.state.isnan().all(-1), held_out)
-        told = window.replace(state=torch.where(held_out[..., None], torch.nan, window.state).requires_grad_())
-        (felt,) = torch.autograd.grad(objective.loss(told, 0.0)[0], told.state)
-        assert torch.equal(felt.abs().amax(-1) > 0, window.real & ~held_out)
+        tracked = window.replace(state=torch.where(held_out[..., None], torch.nan, window.state).requires_grad_())
+        (gradient,) = torch.autograd.grad(objective.loss(tracked, 0.0)[0], tracked.state)
+        assert torch.equal(gradient.abs().amax(-1) > 0, window.real & ~held_out)
 
 
-def test_the_integrators_histories_reach_to_an_episodes_end_and_half_begin_with_one(tmp_path):
-    """A history is shown by its first observation alone."""
+def test_integrator_windows_reach_the_episode_end(tmp_path):
+    """Half of the windows begin with an episode, and each shows only its first observation."""
     dataset = open_dataset(write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 12], physics_dim=18))
     dataset.physics = np.random.default_rng(0).normal(size=(32, 18))
     _, batches = made(dataset, tmp_path, "integrator", shift=0, corruption="none", batch_size=400)
@@ -146,7 +144,7 @@ def test_the_integrators_histories_reach_to_an_episodes_end_and_half_begin_with_
     assert torch.equal(window.obs, window.obs[:, :1].expand_as(window.obs))
 
 
-def test_a_set_without_states_or_with_one_only_is_refused_in_a_line(data, with_states, tmp_path, capsys):
+def test_supervised_methods_reject_missing_or_constant_states(data, with_states, tmp_path, capsys):
     words = ["--preset", "smoke", "--data", str(data), "--out", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as caught:
         main(["pretrain", "--method", "supervised+a", *words])
@@ -163,7 +161,7 @@ SIZE = 16
 
 
 def bright_square(folder: Path, episodes: int = 25, rows: int = 30) -> Path:
-    """A square that drifts over small pictures: two of the simulator's poses tell where, two velocities how fast."""
+    """A square that drifts over small images; two pose and two velocity coordinates hold its motion."""
     g = np.random.default_rng(0)
     rows_of = fake_rows([rows] * episodes, physics_dim=18)
     speed = g.uniform(-1.5, 1.5, (episodes, 1, 2))
@@ -183,7 +181,7 @@ def bright_square(folder: Path, episodes: int = 25, rows: int = 30) -> Path:
     return folder
 
 
-def test_a_trained_reference_knows_pose_and_velocity_that_an_untrained_one_does_not(tmp_path):
+def test_supervised_training_improves_the_probe(tmp_path):
     data, found = bright_square(tmp_path / "walker_walk" / "expert"), {}
     dataset, hidden = open_dataset(data), {"corruption": "zero_frames", "zeroed_frames": 1}
     settings = hidden | {"frame_encoder": "flat", "hidden_dim": 64, "shift": 0, "window": 16, "batch_size": 8}

@@ -1,4 +1,4 @@
-"""Pretraining: what an encoder records, and what is refused. Cut runs are in `test_interruptions.py`."""
+"""Pretraining: recorded settings and invalid input. `test_interruptions.py` covers interrupted runs."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from vd4rl_pomdp.nn import load_encoder
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-def test_an_encoder_tells_how_it_was_pretrained(encoder):
+def test_encoder_records_its_pretraining_settings(encoder):
     settings = load_encoder(encoder)[1].settings
     assert (settings["method"], settings["max_k"], settings["corruption"], settings["task"]) == (
         *("mik+a", 3, "patch+zero_frames", "walker_walk"),
@@ -37,29 +37,29 @@ def test_an_encoder_tells_how_it_was_pretrained(encoder):
         ({"task": "cheetah_run"}, "is a dataset of walker_walk, not of cheetah_run"),
     ],
 )
-def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message):
+def test_invalid_pretraining_settings_leave_no_run(data, tmp_path, change, message):
     with pytest.raises(UserError, match=message):
         run_pretrain(smoke_pretrain(data, tmp_path / "out", **change))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("method", ["mik+a", "random"])
-def test_a_set_without_a_transition_is_refused_whatever_the_method(tmp_path, method):
-    """Advice such as fewer codes or a shorter window leads nowhere there."""
+def test_dataset_without_transitions_is_rejected(tmp_path, method):
+    """Other advice, such as fewer codes or a shorter window, would not help."""
     data = write_fake_set(tmp_path / "walker_walk" / "expert", (1, 1, 1), complete_last=False)
     with pytest.raises(UserError, match="a single row: choose another dataset"):
         run_pretrain(smoke_pretrain(data, tmp_path / "out", method=method))
     assert not (tmp_path / "out").exists()
 
 
-def test_weights_that_no_memory_holds_are_told_as_such(data, tmp_path):
+def test_out_of_memory_is_reported(data, tmp_path):
     words = ["pretrain", "--preset", "smoke", "--data", str(data), "--method", "mik+a", "--out", str(tmp_path / "out")]
     end = run_to_end([*words, "--hidden-dim", "1000000"])
     assert end.code == 2
     assert end.line.startswith("error: out of memory")
 
 
-def test_an_encoder_that_its_last_step_ruins_is_marked_and_not_kept(data, tmp_path, monkeypatch):
+def test_encoder_with_non_finite_weights_is_marked_and_not_saved(data, tmp_path, monkeypatch):
     config = smoke_pretrain(data, tmp_path / "out", steps=2)
 
     def ruin(objective):

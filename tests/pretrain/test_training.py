@@ -1,4 +1,4 @@
-"""The training loop hands an objective what it needs: observations as the agent sees them, and its own step."""
+"""The training loop gives objectives corrupted observations, progress and an update after each step."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def trainer(tmp_path) -> Trainer:
     return Trainer(objective, make_batches(dataset, config, objective), config)
 
 
-def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(trainer: Trainer):
+def test_curl_momentum_encoder_is_updated_every_step(trainer: Trainer):
     objective = trainer.objective
     for _ in range(2):
         old = [p.clone() for p in objective.momentum_encoder.parameters()]
@@ -37,15 +37,15 @@ def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(
             assert not torch.equal(slow, was)
 
 
-def test_an_objective_is_told_how_much_of_the_training_is_done(trainer: Trainer):
-    told, loss = [], trainer.objective.loss
-    trainer.objective.loss = lambda window, progress: (told.append(progress), loss(window, progress))[1]
+def test_objective_receives_training_progress(trainer: Trainer):
+    received, loss = [], trainer.objective.loss
+    trainer.objective.loss = lambda window, progress: (received.append(progress), loss(window, progress))[1]
     for _ in range(3):
         trainer.update()
-    assert told == [0.0, 1 / 20, 2 / 20]
+    assert received == [0.0, 1 / 20, 2 / 20]
 
 
-def test_an_objective_sees_patches_and_rows_of_one_episode(trainer: Trainer):
+def test_objective_sees_corrupted_rows_of_one_episode(trainer: Trainer):
     window = trainer.batches.sample()
     hidden = (window.obs.view(2, 8, 3, 3, 84, 84) == 0).all(3)
     assert (hidden.flatten(3).sum(3) >= 16 * 16).all()
@@ -55,15 +55,15 @@ def test_an_objective_sees_patches_and_rows_of_one_episode(trainer: Trainer):
 SHARED = {"acro": "observation", "driml": "observation", "homer": "observation", "curl": None}
 
 
-def test_observations_share_the_shifts_that_their_method_declares(tmp_path):
-    """A picture with one bright pixel tells its shift; what a method shifts by itself is not shifted before."""
+def test_random_shift_is_shared_as_the_method_declares(tmp_path):
+    """One bright pixel reveals the shift; methods that shift images themselves receive unshifted ones."""
     dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
     dataset.frames = torch.zeros_like(dataset.frames)
     dataset.frames[..., 40, 40] = 255
     for method, asked in (*((name, {}) for name in METHODS), ("acro", {"shift_shared": True})):
         obs = view_of(dataset, PretrainConfig.of("smoke", method=method, **asked)).observe(torch.arange(24).view(4, 6))
         places = obs[:, :, 0].flatten(2).int().argmax(2)
-        assert (obs.view(4, 6, 9, -1).int().argmax(3) == places[..., None]).all(), "frames of one observation share it"
+        assert (obs.view(4, 6, 9, -1).int().argmax(3) == places[..., None]).all(), "one shift per observation"
         shared = "window" if asked else SHARED.get(method, "window")
         assert (places == 40 * 84 + 40).all() == (shared is None), method
         assert ((places == places[:, :1]).all()).item() == (shared != "observation"), method
@@ -71,8 +71,8 @@ def test_observations_share_the_shifts_that_their_method_declares(tmp_path):
 
 
 @pytest.mark.parametrize(("method", "changes"), [("mik+a", {}), ("random", {"history": "gru"}), ("random", {})])
-def test_an_encoder_of_states_reads_standardised_ones_of_which_a_share_is_hidden(tmp_path, method, changes):
-    """Coordinates are zero, their mean, where they are hidden, others whenever a row enters a batch."""
+def test_state_frame_encoder_reads_standardised_partly_hidden_states(tmp_path, method, changes):
+    """Hidden coordinates are zero, and redrawn whenever a row enters a batch."""
     dataset = open_dataset(write_fake_set(tmp_path / "walker_walk" / "expert", [40, 60], physics_dim=18), tmp_path)
     dataset.physics = np.random.default_rng(0).normal(size=(100, 18)) * np.arange(1, 19) + 5
     given = {"method": method, "frame_encoder": "state", "corruption": "none", "batch_size": 32} | changes
@@ -93,8 +93,8 @@ def test_an_encoder_of_states_reads_standardised_ones_of_which_a_share_is_hidden
         objective.loss(window, 0.0)
 
 
-def test_frames_before_the_future_are_blanked_in_what_was_shifted_and_corrupted(tmp_path):
-    """Behind patches of 200: what a patch or a shift put into a blanked frame is gone, too."""
+def test_older_future_frames_are_blanked_after_corruption(tmp_path):
+    """Blanking also removes the fill (200) of patches."""
     dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
     config = PretrainConfig.of("smoke", future_frames="newest", corruption="patch", patch_fill=200)
     objective = build_objective(config, 6, build_target(config, dataset.action.numpy()))
