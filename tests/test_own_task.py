@@ -121,10 +121,7 @@ def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into
     [
         ({"quality": "expert"}, "centre has no states for an actor to read: use --quality random"),
         ({"quality": "medium_replay"}, "centre has no states"),
-        (
-            {"task": "cartpole_swingup", "quality": "expert"},
-            "no expert actor ships for cartpole_swingup .*train_actor",
-        ),
+        ({"task": "cartpole_swingup", "quality": "expert"}, "no expert actor ships for cartpole_swingup .*train_actor"),
         ({"task": "cartpole_swingup", "quality": "expert_noisy"}, "has no action_noise: .*--action-noise"),
         ({"frame_size": 15}, "--frame-size is 15; it must be at least 16 and at most 480"),
     ],

@@ -29,11 +29,7 @@ def spins(code: str, **environment: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "module",
-    [
-        *("vd4rl_pomdp", "pretrain", "finetune", "baselines"),
-        *("vd4rl_pomdp.cli", "vd4rl_pomdp.__main__"),
-    ],
+    "module", [*("vd4rl_pomdp", "pretrain", "finetune", "baselines"), *("vd4rl_pomdp.cli", "vd4rl_pomdp.__main__")]
 )
 def test_whatever_is_imported_first_threads_sleep_while_they_wait(module):
     assert spins(f"import {module}; import torch") == {"0"}

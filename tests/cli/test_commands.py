@@ -23,10 +23,7 @@ SLIPS = [
     (["data", "check", "x\ny"], "x y: no such folder"),
     (["pretrain", "--preset", "huge"], "unknown preset 'huge': choose one of paper, cpu, smoke"),
     ([*PRETRAIN, "--corruption", "fog"], "unknown corruption 'fog'"),
-    (
-        [*PRETRAIN, "--corruption", "patch+patch"],
-        "unknown corruption 'patch+patch': join stages",
-    ),
+    ([*PRETRAIN, "--corruption", "patch+patch"], "unknown corruption 'patch+patch': join stages"),
     ([*PRETRAIN, "--method", "m"], "unknown method 'm'"),
     ([*PRETRAIN, "--method", "random", "--codes", "3"], "Unrecognized options: --codes"),
     ([*PRETRAIN, "--precision", "fp8"], "invalid choice 'fp8'"),

@@ -83,11 +83,7 @@ class Backbone(nn.Conv2d):
 
 MUTANTS = [
     (Bounded, features_have_one_shape, "some are not finite"),
-    (
-        lambda: nn.BatchNorm2d(4),
-        pictures_are_not_mixed,
-        r"features of image 1 have gradients to \[True, True, True\]",
-    ),
+    (lambda: nn.BatchNorm2d(4), pictures_are_not_mixed, r"features of image 1 have gradients to \[True, True, True\]"),
     (Lost, gradients_reach_all_parameters, "none reaches convolutions.1.unused.bias, convolutions.1.unused.weight"),
     (nn.Dropout, a_seed_decides_everything, "features differ between calls, training True"),
     (Hidden, a_folder_gives_back_the_encoder, "its features differ"),

@@ -68,13 +68,7 @@ def test_reference_round_trip_and_retired_actor(tmp_path):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"data_return": "much"},
-        {"path_error": [1]},
-        {"actor": "expert"},
-        {"actor": {"task": "walker_walk"}},
-        None,
-    ],
+    [{"data_return": "much"}, {"path_error": [1]}, {"actor": "expert"}, {"actor": {"task": "walker_walk"}}, None],
     ids=str,
 )
 def test_damaged_reference_is_rejected(tmp_path, change):

@@ -156,10 +156,7 @@ def test_an_environment_is_made_by_its_id_with_its_arguments():
     ("arguments", "message"),
     [
         ({"space": gymnasium.spaces.Discrete(3)}, r"has the actions Discrete\(3\)"),
-        (
-            {"space": gymnasium.spaces.Box(-3, 3, (2,), np.int64)},
-            r"has the actions Box\(-3, 3, \(2,\), int64\), but a",
-        ),
+        ({"space": gymnasium.spaces.Box(-3, 3, (2,), np.int64)}, r"has the actions Box\(-3, 3, \(2,\), int64\), but a"),
         ({"space": gymnasium.spaces.Box(-1, 1, (0,))}, r"has the actions Box\(.*needs a bounded Box"),
         ({"high": np.inf}, "Counter has actions from -1 to inf: only bounds within -1e[+]09 and 1e[+]09 can be"),
         ({"low": -1e10}, "Counter has actions from -1e[+]10 to 1: only bounds"),

@@ -40,8 +40,4 @@ def test_a_caught_mutant_a_survivor_and_an_edit_that_no_longer_applies_are_told_
     with pytest.raises(ValueError, match=r"wrong: its old text is in double.py 0 times, not once"):
         script.mutated(mutants[0] | {"old": "4 * x"}, tmp_path)
     assert script.main() == 1
-    assert capsys.readouterr().out.splitlines() == [
-        "1/2 caught: wrong",
-        "2/2 SURVIVED: same at 2",
-        "1 of 2 caught",
-    ]
+    assert capsys.readouterr().out.splitlines() == ["1/2 caught: wrong", "2/2 SURVIVED: same at 2", "1 of 2 caught"]

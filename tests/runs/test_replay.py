@@ -117,8 +117,7 @@ class Draws(Regression):
 
 
 @pytest.mark.parametrize(
-    ("made", "reason"),
-    [(Reads, "item|local_scalar"), (Counts, "count"), (Rebinds, "mean"), (Draws, "randn")],
+    ("made", "reason"), [(Reads, "item|local_scalar"), (Counts, "count"), (Rebinds, "mean"), (Draws, "randn")]
 )
 def test_steps_that_cannot_be_captured_run_eagerly_with_one_warning(
     made: type[Regression], reason: str, capsys: pytest.CaptureFixture[str]

@@ -130,10 +130,7 @@ def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"maze": "no_curtain"}, "--maze is no_curtain, where a planner drives"),
-        ({"decisions": 0}, "--decisions is 0"),
-    ],
+    [({"maze": "no_curtain"}, "--maze is no_curtain, where a planner drives"), ({"decisions": 0}, "--decisions is 0")],
 )
 def test_wrong_settings_of_a_policy_are_named(tmp_path, changes, message):
     with pytest.raises(UserError, match=message):

@@ -195,10 +195,7 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
         ({"method": "curl"}, "curl predicts no actions: choose one of no_history, ah"),
         ({"window": 41}, r"episode 0 has 40 rows, fewer than the window of 41"),
         ({"frame_encoder": "mixer", "picture": "grey50", "burn_in": 20}, "--burn-in 20 leaves no row"),
-        (
-            {"future_frames": "newest"},
-            "--future-frames newest blanks older frames of a stack, but observations here",
-        ),
+        ({"future_frames": "newest"}, "--future-frames newest blanks older frames of a stack, but observations here"),
         ({"steps": 0}, "--steps is 0"),
         ({"exogenous": "nowhere"}, "nowhere: no such folder"),
         ({"exogenous": "photographs", "exogenous_weight": 2.0}, "--exogenous-weight is 2.0"),

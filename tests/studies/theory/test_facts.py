@@ -11,15 +11,7 @@ from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths, clash, 
 from vd4rl_pomdp.studies.theory.law import joint_law
 from vd4rl_pomdp.studies.theory.partition import state_relation
 from vd4rl_pomdp.studies.theory.study import facts
-from vd4rl_pomdp.studies.theory.world import (
-    counterexample,
-    distances,
-    echo,
-    momentum,
-    past_memory,
-    period,
-    tiny,
-)
+from vd4rl_pomdp.studies.theory.world import counterexample, distances, echo, momentum, past_memory, period, tiny
 
 
 def test_every_fact_is_computed_and_contradicts_what_is_printed():

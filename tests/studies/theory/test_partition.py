@@ -6,11 +6,7 @@ from hypothesis import given, settings
 
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.studies.theory.classifiers import VIEWS, MemoryLengths
-from vd4rl_pomdp.studies.theory.partition import (
-    forced_shares,
-    relation,
-    state_classes,
-)
+from vd4rl_pomdp.studies.theory.partition import forced_shares, relation, state_classes
 from vd4rl_pomdp.studies.theory.world import biased, counterexample, echo
 
 MEMORY = MemoryLengths(3, 3)

@@ -49,12 +49,7 @@ def test_the_computed_table(shown):
 def test_the_papers_equations_where_their_assumptions_hold(shown):
     study, _ = shown
     broken = {(row["method"], row["where"]) for row in study["equations"] if row["decodes"] and row["fails_k"]}
-    assert broken == {
-        ("fj", "k > m"),
-        ("fj+a", "k > m"),
-        ("fj+a literal", "k > m"),
-        ("mik+a literal", "every k"),
-    }
+    assert broken == {("fj", "k > m"), ("fj+a", "k > m"), ("fj+a literal", "k > m"), ("mik+a literal", "every k")}
     early = [r for r in study["equations"] if r["method"] == "fj+a" and r["where"] == "k <= m"]
     assert all(row["holds_k"] and not row["fails_k"] for row in early)
 

@@ -7,14 +7,7 @@ from hypothesis import given, settings
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.studies.theory.law import joint_law
-from vd4rl_pomdp.studies.theory.world import (
-    counterexample,
-    diameter,
-    distances,
-    finite_world,
-    period,
-    uniform,
-)
+from vd4rl_pomdp.studies.theory.world import counterexample, diameter, distances, finite_world, period, uniform
 
 HALF = Fraction(1, 2)
 
