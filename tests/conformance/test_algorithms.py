@@ -25,11 +25,11 @@ from vd4rl_pomdp.testing.contract import run_check
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_an_algorithm_keeps_its_promises(name, check):
+def test_algorithm_conforms(name, check):
     run_check("algorithm", check, name)
 
 
-def test_checks_leave_the_callers_generators_alone():
+def test_checks_do_not_change_global_generators():
     torch.manual_seed(3)
     np.random.seed(3)  # noqa: NPY002
     expected = torch.rand(2), np.random.rand(2)  # noqa: NPY002
@@ -163,13 +163,13 @@ def algorithms():
 
 
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_an_algorithm_that_breaks_a_promise_is_told_which_and_how(algorithms, kind, check, reason):
+def test_nonconforming_algorithms_are_caught(algorithms, kind, check, reason):
     algorithms.register("mine", kind)
     with pytest.raises(AssertionError, match=f"algorithm 'mine' violates its contract(.|\n)*{reason}"):
         run_check("algorithm", check, "mine")
 
 
-def test_options_reach_the_algorithm_and_unknown_names_are_refused():
+def test_check_algorithm_accepts_options():
     check_algorithm("iql", expectile=0.9)
     with pytest.raises(UserError, match="--expectile is not read by the algorithm bc"):
         check_algorithm("bc", expectile=0.9)

@@ -25,7 +25,7 @@ from vd4rl_pomdp.testing.corruptions import (
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", dict.fromkeys([*CORRUPTIONS, *STAGES]))
-def test_a_corruption_keeps_its_promises(name, check):
+def test_corruption_conforms(name, check):
     run_check("corruption", check, name)
 
 
@@ -33,7 +33,7 @@ def test_a_corruption_keeps_its_promises(name, check):
 @pytest.mark.parametrize(
     "options", [{}, {"patch_fill": 7, "patch_count": 2}, {"patch_shared": True}], ids=["", "two grey ones", "shared"]
 )
-def test_patches_and_zeroed_frames_keep_them_with_other_options(options, zeroed):
+def test_patch_and_zero_frames_conform_with_options(options, zeroed):
     check_corruption("patch+zero_frames", zeroed_frames=zeroed, **options)
 
 
@@ -46,7 +46,7 @@ def test_patches_and_zeroed_frames_keep_them_with_other_options(options, zeroed)
         ("patch+truncate", {"kept": "newest"}),
     ],
 )
-def test_other_ways_to_drop_frames_keep_them(name, options):
+def test_frame_drops_conform_with_options(name, options):
     check_corruption(name, **options)
 
 
@@ -61,7 +61,7 @@ class Alternating(FrameDrop):
         return torch.arange(stack) * torch.where(key % 2 == 0, -1, 1)[:, None]
 
 
-def test_a_drop_of_ones_own_keeps_them_and_ends_a_name(stages):
+def test_user_defined_frame_drop_conforms(stages):
     stages.register("mine", Alternating)
     for name in ("mine", "patch+mine"):
         check_corruption(name)
@@ -151,25 +151,25 @@ def stages():
         yield STAGES
 
 
-def test_a_stage_that_does_something_else_than_the_one_it_inherits_from_is_called_on_frames(stages):
+def test_overridden_call_of_a_subclass_is_used(stages):
     stages.register("mine", Inheriting)
     run_check("corruption", a_view_shows_shifted_then_corrupted_stacks, "mine")
 
 
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_a_corruption_that_breaks_a_promise_is_told_which_and_how(stages, kind, check, reason):
+def test_nonconforming_corruptions_are_caught(stages, kind, check, reason):
     stages.register("mine", kind)
     with pytest.raises(AssertionError, match=f"corruption 'mine' violates its contract(.|\n)*{reason}"):
         run_check("corruption", check, "mine")
 
 
-def test_a_changed_input_is_caught(monkeypatch):
+def test_modified_input_is_caught(monkeypatch):
     monkeypatch.setattr(Corruption, "__call__", Corruption.apply_)
     with pytest.raises(AssertionError, match="the input was changed"):
         run_check("corruption", pixels_stay_pixels, "patch")
 
 
-def test_options_reach_the_stages_and_unknown_ones_are_refused(stages):
+def test_check_corruption_accepts_options(stages):
     stages.register("larger", type("Larger", (Patch,), {}))
     check_corruption("larger", patch_size=20)
     with pytest.raises(UserError, match="--zeroed-frames is not read by the corruption patch"):

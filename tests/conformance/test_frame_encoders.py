@@ -28,7 +28,7 @@ SIZE = 20
 @pytest.mark.parametrize(
     "name", [name for name in FRAME_ENCODERS if name != "pretrained"]
 )  # tests/nn/test_pretrained.py
-def test_a_frame_encoder_keeps_its_promises(name, check):
+def test_frame_encoder_conforms(name, check):
     run_check("frame encoder", check, name, size=50)
 
 
@@ -97,18 +97,18 @@ def encoders():
 
 
 @pytest.mark.parametrize(("layer", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_a_frame_encoder_that_breaks_a_promise_is_told_which_and_how(encoders, layer, check, reason):
+def test_nonconforming_frame_encoders_are_caught(encoders, layer, check, reason):
     encoders.register("mine", FrameEncoderPart(with_layer(layer)))
     with pytest.raises(AssertionError, match=f"frame encoder 'mine' violates its contract(.|\n)*{reason}"):
         run_check("frame encoder", check, "mine", size=SIZE)
 
 
-def test_a_frozen_backbone_breaks_no_promise(encoders):
+def test_frozen_backbone_conforms(encoders):
     encoders.register("mine", FrameEncoderPart(with_layer(Backbone)))
     check_frame_encoder("mine", size=SIZE)
 
 
-def test_a_right_one_passes_at_any_size_and_what_cannot_be_is_refused(encoders):
+def test_check_frame_encoder_accepts_conforming_encoders(encoders):
     encoders.register("mine", FrameEncoderPart(convolution))
     check_frame_encoder("mine")
     check_frame_encoder("mine", size=SIZE, feature_dim=5)
@@ -143,7 +143,7 @@ class OverFrames(nn.Module):
 
 
 @pytest.mark.parametrize("layer", [Twice, OverFrames])
-def test_shared_weights_and_convolutions_of_other_dimensions_are_kept(encoders, layer):
+def test_shared_weights_and_3d_convolutions_conform(encoders, layer):
     encoders.register("mine", FrameEncoderPart(with_layer(layer)))
     check_frame_encoder("mine", size=SIZE)
 
@@ -161,12 +161,12 @@ class Pair(nn.Module):
         (lambda channels, size, options: Pair(), r"'mine' makes a tuple of N images, not maps \(N, C', H', W'\)"),
     ],
 )
-def test_what_builds_no_module_of_maps_is_refused(encoders, build, message):
+def test_invalid_frame_encoders_are_rejected(encoders, build, message):
     encoders.register("mine", FrameEncoderPart(build))
     with pytest.raises(UserError, match=message):
         make("mine", size=SIZE)
 
 
-def test_the_name_of_what_reads_states_is_refused(encoders):
+def test_reserved_frame_encoder_name_is_rejected(encoders):
     with pytest.raises(UserError, match="frame encoder 'state': this name is reserved"):
         encoders.register("state", FrameEncoderPart(convolution))

@@ -37,7 +37,7 @@ from vd4rl_pomdp.testing.memories import (
     ],
     ids=str,
 )
-def test_a_memory_keeps_its_promises(check, name, options):
+def test_memory_conforms(check, name, options):
     run_check("memory", check, name, **options)
 
 
@@ -47,7 +47,7 @@ def memories():
         yield MEMORIES
 
 
-def test_methods_keep_their_promises_with_the_pages_memory(tmp_path, monkeypatch):
+def test_methods_conform_with_documented_memory(tmp_path, monkeypatch):
     with isolated_registries():
         load_example("my_memory.py", tmp_path, monkeypatch)
         check_method("mik+a", history="linear")
@@ -55,7 +55,7 @@ def test_methods_keep_their_promises_with_the_pages_memory(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("history", ["transformer", "lru"])
-def test_a_memory_goes_through_every_stage(data, own_cache, tmp_path, history):
+def test_memories_train_in_all_stages(data, own_cache, tmp_path, history):
     made = pretrain(smoke_pretrain(data, tmp_path / "pretrained", method="mik+a", history=history, steps=1)).path
     brief = {"updates": 1, "batch_size": 4, "eval_length": 2, "random_histories": 0.5, "precision": "bf16"}
     assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
@@ -125,19 +125,19 @@ class Hidden(GRU):
         (Hidden, a_folder_gives_back_the_encoder, "its states differ"),
     ],
 )
-def test_a_memory_that_breaks_a_promise_is_told_which_and_how(memories, kind, check, reason):
+def test_nonconforming_memories_are_caught(memories, kind, check, reason):
     memories.register("mine", MemoryPart(kind, GRUOptions))
     with pytest.raises(AssertionError, match=f"memory 'mine' violates its contract(.|\n)*{reason}"):
         run_check("memory", check, "mine")
 
 
 @pytest.mark.parametrize("name", ["none", "method"])
-def test_words_that_history_has_for_something_else_are_refused(memories, name):
+def test_reserved_memory_names_are_rejected(memories, name):
     with pytest.raises(UserError, match=f"memory '{name}': this name is reserved"):
         memories.register(name, MemoryPart(GRU, GRUOptions))
 
 
-def test_what_is_no_memory_is_refused_where_it_is_built(memories):
+def test_invalid_memories_are_rejected(memories):
     memories.register("mine", MemoryPart(lambda inputs, options: torch.nn.Identity()))
     with pytest.raises(UserError, match=r"memory .mine. builds a Identity, not a vd4rl"):
         check_memory("mine")

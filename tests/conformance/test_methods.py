@@ -29,17 +29,17 @@ CASES = [(name, check) for name in METHODS for check in checks_of(name)]
 
 
 @pytest.mark.parametrize(("name", "check"), CASES, ids=lambda value: getattr(value, "__name__", value))
-def test_a_method_keeps_its_promises(name: str, check: Callable):
+def test_method_conforms(name: str, check: Callable):
     run_check("method", check, name)
 
 
-def test_the_loss_of_an_inverse_method_is_its_action_loss():
+def test_inverse_loss_is_the_action_loss():
     """`check_method` proves what weighted terms add to it."""
     loss, logs = build("mik+a").loss(batch(), 0.0)
     assert torch.equal(loss.detach(), logs["action_loss"])
 
 
-def test_self_prediction_moves_the_prediction_and_never_its_target():
+def test_self_prediction_has_no_gradient_to_its_target():
     """||sg(s_{t+k}) - g(s_t, k)||^2: a window's last state is nothing but a target, so no gradient may reach it."""
     objective, window = build("mik+a", self_prediction=1.0), batch((ROWS, ROWS))
     past, future = (x.detach().requires_grad_() for x in objective.representations(window))
@@ -171,14 +171,14 @@ def methods():
 
 
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_a_method_that_breaks_a_promise_is_told_which_and_how(methods, kind, check, reason):
+def test_nonconforming_methods_are_caught(methods, kind, check, reason):
     options = {"options": InverseOptions} if issubclass(kind, StateInverse) else {}
     methods.register("mine", Method(kind, **options))
     with pytest.raises(AssertionError, match=f"method 'mine' violates its contract(.|\n)*{reason}"):
         run_check("method", check, "mine")
 
 
-def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_are_refused(methods):
+def test_check_method_accepts_conforming_methods(methods):
     methods.register("mine", Method(Mean))
     check_method("mine")
     check_method("mine", feature_dim=5)

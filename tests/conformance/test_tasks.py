@@ -29,7 +29,7 @@ from vd4rl_pomdp.testing.tasks import (
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", TASKS)
-def test_a_task_keeps_its_promises(name, check):
+def test_task_conforms(name, check):
     run_check("task", check, name)
 
 
@@ -96,13 +96,13 @@ MUTANTS = [
 
 
 @pytest.mark.parametrize(("task", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_a_task_that_breaks_a_promise_is_told_which_and_how(tasks, task, check, reason):
+def test_nonconforming_tasks_are_caught(tasks, task, check, reason):
     tasks.register("mine", task)
     with pytest.raises(AssertionError, match=f"task 'mine' violates its contract(.|\n)*{reason}"):
         run_check("task", check, "mine")
 
 
-def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
+def test_harness_defects_are_caught(tasks, monkeypatch):
     from vd4rl_pomdp.envs.gymnasium_task import GymnasiumEnv
     from vd4rl_pomdp.envs.pixels import PixelEnv
 
@@ -142,7 +142,7 @@ def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
                 run_check("task", check, "walker_walk" if place is dmc else "mine")
 
 
-def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
+def test_check_task_accepts_conforming_tasks(tasks):
     tasks.register("strict", GymnasiumTask(Strict, decisions=5))
     tasks.register("reacher", DMCTask("reacher", "easy"))  # it draws a target, and cannot be replayed
     check_task("strict")
@@ -152,7 +152,7 @@ def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
 
 
 @pytest.mark.parametrize("task", ["lqr_2_1", "lqr_6_2"])
-def test_a_task_of_dm_control_without_bounds_is_refused_wherever_it_is_played(tasks, tmp_path, task):
+def test_unbounded_dm_control_tasks_are_rejected(tasks, tmp_path, task):
     tasks.register("unbounded", DMCTask("lqr", task))
     message = f"dm_control's lqr {task} has actions from -1e[+]10 to 1e[+]10: only bounds within -1e[+]09 and 1e[+]09"
     for play in (

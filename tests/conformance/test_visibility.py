@@ -17,7 +17,7 @@ from vd4rl_pomdp.testing.methods import ROWS, claim_visibility
 from vd4rl_pomdp.testing.methods import build_inverse as inverse
 
 
-def test_a_wrong_pair_is_named_with_what_it_sees():
+def test_wrong_pair_is_described():
     objective = inverse("acro")
     objective.visible = lambda t, k, rows: ({t, t + k}, {t})
     message = (
@@ -32,7 +32,7 @@ def test_a_wrong_pair_is_named_with_what_it_sees():
 @pytest.mark.parametrize(
     ("method", "options"), [("mik+a", {}), ("mik+a", {"m": 2, "n": 2}), ("mik", {}), ("ah+a", {}), ("fj+a", {"m": 1})]
 )
-def test_with_the_integrators_memory_a_state_sees_one_observation_and_all_actions_since(method, options):
+def test_integrator_sees_one_observation_and_later_actions(method, options):
     objective = inverse(method, history="integrator", **options)
     claim_visibility(objective, [ROWS, ROWS, 4], ROWS)
     first = max(0, 4 - options.get("m", ROWS))
@@ -40,7 +40,7 @@ def test_with_the_integrators_memory_a_state_sees_one_observation_and_all_action
 
 
 @pytest.mark.parametrize("row", [0, 1])
-def test_a_frame_too_many_in_the_futures_first_rows_is_caught(row: int):
+def test_extra_frame_in_the_future_is_caught(row: int):
     """The rows that are seen stay the same: only the count of frames tells."""
     objective = inverse("mik+a", future_frames="newest")
     blanked = objective._blanked
@@ -57,14 +57,14 @@ def shift_states(objective: InverseObjective, which: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("method", ["mik", "mik+a", "fj", "acro"])
-def test_either_end_of_a_pair_is_caught_alone(method: str, which: int):
+def test_each_end_of_a_pair_is_checked(method: str, which: int):
     objective = inverse(method, **({"m": 1} if method == "fj" else {}))
     shift_states(objective, (which,))
     assert wrong_pairs(objective, [ROWS])
 
 
 @pytest.mark.parametrize("method", ["ah+a", "fj+a", "mik+a"])
-def test_actions_that_are_one_row_early_or_unseen_are_caught(method: str):
+def test_shifted_and_unseen_actions_are_caught(method: str):
     for change in (lambda a: a.roll(-1, 1), lambda a: a * 0):
         objective = inverse(method, **({"m": 1} if method == "fj+a" else {}))
         encode = objective.encoder.from_features
@@ -74,14 +74,14 @@ def test_actions_that_are_one_row_early_or_unseen_are_caught(method: str):
 
 @pytest.mark.parametrize("method", ["fj", "fj+a"])
 @pytest.mark.parametrize("error", [-1, 1])
-def test_a_window_one_row_too_long_or_short_is_caught(method: str, error: int):
+def test_windows_off_by_one_row_are_caught(method: str, error: int):
     objective = inverse(method, m=2)
     declared_by = inverse(method, m=2 + error)
     objective.past_visible = declared_by.past_visible
     assert wrong_pairs(objective, [ROWS])
 
 
-def test_more_mutants_are_caught():
+def test_further_visibility_mutants_are_caught():
     mixing = inverse("acro")
     frame = mixing.encoder.frame.forward
     mixing.encoder.frame.forward = lambda obs: (z := frame(obs)) - z.mean(1, keepdim=True)
@@ -109,7 +109,7 @@ def leak(objective: InverseObjective, what: Callable[[Windows], torch.Tensor]) -
     ],
     ids=["detached action", "compared action", "rounded next picture"],
 )
-def test_leaks_that_gradients_do_not_pass_are_caught(what: Callable[[Windows], torch.Tensor]):
+def test_leaks_without_gradient_are_caught(what: Callable[[Windows], torch.Tensor]):
     objective = inverse("mik+a")
     leak(objective, what)
     blind = dependence(objective, [ROWS])
@@ -117,14 +117,14 @@ def test_leaks_that_gradients_do_not_pass_are_caught(what: Callable[[Windows], t
     assert wrong_pairs(objective, [ROWS])
 
 
-def test_a_detached_leak_between_windows_is_caught():
+def test_detached_leak_between_windows_is_caught():
     objective = inverse("acro")
     leak(objective, lambda w: w.action.detach().mean((0, 1)).mean() + torch.zeros(()))
     with pytest.raises(ValueError, match="another window"):
         response(objective, [ROWS, ROWS])
 
 
-def test_a_declared_row_that_no_gradient_reaches_is_caught():
+def test_declared_row_without_gradient_is_caught():
     objective = inverse("ah")
     encode = objective.encoder.from_features
     objective.encoder.from_features = lambda f, a: encode(torch.cat([f[:, :1].detach(), f[:, 1:]], 1), a)
@@ -132,7 +132,7 @@ def test_a_declared_row_that_no_gradient_reaches_is_caught():
     assert wrong_pairs(objective, [ROWS])
 
 
-def test_predictions_that_draw_are_refused_until_they_repeat():
+def test_random_predictions_must_be_repeatable():
     objective = inverse("acro")
     objective.head.rest.insert(0, torch.nn.Dropout(0.5))
     with pytest.raises(ValueError, match="put the objective into eval mode"):

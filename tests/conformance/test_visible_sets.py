@@ -90,13 +90,13 @@ Case = tuple[str, tuple[str, ...]]
 LINES = [line.split() for line in DRAWN.strip().splitlines()[2:] if line]
 
 
-def test_only_forward_jumps_are_bounded_unless_it_is_asked_for():
+def test_only_fj_has_a_bounded_past_by_default():
     """The windows below are too short to show it."""
     bounded = {name: method.past for name, method in METHODS.items() if method.past is not None}
     assert bounded == {"fj": JUMPS_PAST, "fj+a": JUMPS_PAST}
 
 
-def test_every_inverse_method_is_drawn():
+def test_drawn_cases_cover_all_inverse_methods():
     assert {line[0] for line in LINES} == {name for name in METHODS if predicts_actions(name)}
 
 
@@ -113,7 +113,7 @@ def seen_by(method: str, words: tuple[str, ...], frames: bool = False) -> tuple[
 
 
 @pytest.mark.parametrize("line", LINES, ids=" ".join)
-def test_a_prediction_depends_on_what_is_drawn(line: list[str]):
+def test_predictions_depend_on_drawn_sets(line: list[str]):
     method, options, window, t, k, rows, actions = line
     objective, felt, followed = seen_by(method, words_of(options))
     place = WINDOWS[window], int(t), int(k)
@@ -195,7 +195,7 @@ def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: in
 @pytest.mark.parametrize(
     ("method", "words"), BOUNDED, ids=lambda value: value if isinstance(value, str) else ",".join(value)
 )
-def test_every_pair_sees_what_the_papers_table_says(method: str, words: tuple[str, ...], frames: bool):
+def test_visible_sets_match_the_papers_table(method: str, words: tuple[str, ...], frames: bool):
     """Rows; or frames, of which each row shows its own and the two before it: masked ones, too, unless blanked."""
     objective, felt, followed = seen_by(method, words, frames)
     assert len(felt) == sum(len(objective.pairs(length)) for length in LENGTHS)
@@ -211,7 +211,7 @@ def test_every_pair_sees_what_the_papers_table_says(method: str, words: tuple[st
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if predicts_actions(name)])
-def test_leaks_of_the_target_are_those_of_the_papers_table(method: str):
+def test_target_leaks_match_the_papers_table(method: str):
     """a_t itself: AH+A always, FJ+A up to m, the literal MIK+A at k = 1, and nobody else."""
     for words in ((), ("literal",)) if method == "mik+a" else (("m=2",),) if method.startswith("fj") else ((),):
         leaks = {k for (_, t, k), (_, actions) in seen_by(method, words)[1].items() if t in actions}

@@ -75,13 +75,13 @@ def past(t: int, method: str, told: dict) -> tuple[set[int], set[int]]:
 
 
 @pytest.mark.parametrize(("method", "told"), MEMORIES, ids=str)
-def test_a_representation_depends_on_its_past_alone(method: str, told: dict):
+def test_representations_depend_only_on_their_past(method: str, told: dict):
     encoder = build_inverse(method, **told).encoder.eval()
     assert read_by(encoder) == [past(t, method, told) for t in range(ROWS)]
 
 
 @pytest.mark.parametrize("method", ["mik+a", "fj", "supervised", "acro"])
-def test_a_readout_depends_on_the_frame_the_state_or_both(method: str):
+def test_readouts_depend_on_frame_or_state(method: str):
     encoder = build_inverse(method).encoder.eval()
     widths = {"state": encoder.dim, "frame": encoder.config.feature_dim}
     for readout in ("state", "frame", "frame+state"):
@@ -141,7 +141,7 @@ def on_frames(dataset: Dataset, method: str, stack: int) -> InverseObjective:
 @pytest.mark.parametrize("stack", [1, 3])
 @pytest.mark.parametrize("method", STORED)
 @torch.no_grad()
-def test_predictions_depend_on_their_own_episodes_stored_rows_alone(dataset: Dataset, method: str, stack: int):
+def test_predictions_depend_only_on_their_episodes_rows(dataset: Dataset, method: str, stack: int):
     """Frames of the stacks that are seen, which may begin before the window, and a_j, which row j+1 stores."""
     objective = on_frames(dataset, method, stack)
     starts = [(e, first) for e, rows in enumerate(EPISODES) for first in range(rows - SPAN + 1)]
@@ -181,7 +181,7 @@ first row shows its frame alone.
 
 @pytest.mark.parametrize(("end", "readout", "window"), GIVEN, ids=str)
 @torch.no_grad()
-def test_what_a_policy_is_given_depends_on_its_history_alone(dataset: Dataset, end: str, readout: str, window: int):
+def test_policy_input_depends_only_on_its_history(dataset: Dataset, end: str, readout: str, window: int):
     trained = build_inverse("mik+a").encoder
     encoder = Encoder(replace(trained.config, readout=readout, history_window=window)).double().eval()
     encoder.load_state_dict(trained.state_dict())

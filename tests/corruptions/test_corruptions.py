@@ -40,14 +40,14 @@ def stacks(n: int = 64) -> torch.Tensor:
         ),
     ],
 )
-def test_a_config_that_would_do_other_things_is_refused(dataset, config, message):
+def test_inconsistent_configs_are_rejected(dataset, config, message):
     for made in (lambda: make_corruption(config), lambda: BatchCorruption(config, 0), lambda: View(dataset, config)):
         with pytest.raises(UserError, match=message):
             made()
 
 
 @pytest.mark.parametrize("key", [torch.arange(1), torch.arange(5), torch.arange(12).int(), torch.arange(12.0)])
-def test_every_stack_needs_a_key_of_its_own(key):
+def test_keys_must_match_stacks(key):
     with pytest.raises(UserError, match=r"need int64 ones of shape \(12,\), one a stack"):
         make_corruption("patch")(stacks(12), key)
 
@@ -72,7 +72,7 @@ def test_draws_are_uniform_and_depend_on_every_key():
     assert (correlation - torch.eye(3)).abs().max() < 0.03
 
 
-def test_patch_zeroes_one_square_of_the_stated_size_in_every_frame():
+def test_patch_zeroes_one_square_per_frame():
     obs = stacks()
     out = make_corruption("patch")(obs, torch.arange(64))
     frames = out.view(64 * 3, 3, 84, 84)
@@ -85,8 +85,8 @@ def test_patch_zeroes_one_square_of_the_stated_size_in_every_frame():
     assert len(torch.unique(hidden.view(64 * 3, -1).int().argmax(1))) > 100
 
 
-def test_a_patch_is_anywhere_it_fits_in_equally_often():
-    """Five places from top to bottom, five from left to right: 25 squares, each as likely as the others."""
+def test_patch_position_is_uniform():
+    """With 5 vertical and 5 horizontal positions all 25 squares are equally likely."""
     frames = torch.full((2000, 9, 20, 20), 255, dtype=torch.uint8)
     hidden = (make_corruption("patch")(frames, torch.arange(2000)).view(6000, 3, 20, 20) == 0).all(1)
     top, left = hidden.any(2).int().argmax(1), hidden.any(1).int().argmax(1)
@@ -95,7 +95,7 @@ def test_a_patch_is_anywhere_it_fits_in_equally_often():
     assert ((counts - 240) ** 2 / 240).sum() < 60  # chi-square, 24 degrees of freedom: 99.99% quantile is 58
 
 
-def test_shared_patches_are_at_the_same_place_in_all_frames_of_a_stack():
+def test_shared_patches_have_one_position_per_stack():
     out = make_corruption(CorruptionConfig.of("patch", patch_shared=True))(stacks(), torch.arange(64))
     hidden = (out.view(64, 3, 3, 84, 84) == 0).all(2)
     assert torch.equal(hidden[:, 0], hidden[:, 1])
@@ -104,14 +104,14 @@ def test_shared_patches_are_at_the_same_place_in_all_frames_of_a_stack():
     assert not torch.equal(hidden[:, 0], hidden[:, 1])
 
 
-def test_zero_frames_blanks_two_of_three_each_equally_often():
+def test_zero_frames_blanks_two_of_three_uniformly():
     out = make_corruption("zero_frames")(stacks(1).expand(3000, -1, -1, -1), torch.arange(3000))
     blank = (out.view(3000, 3, -1) == 0).all(2)
     assert (blank.sum(1) == 2).all()
     assert ((blank.float().mean(0) - 2 / 3).abs() < 0.03).all()
 
 
-def test_resample_draws_anew_and_emission_never_does():
+def test_resample_redraws_and_emission_does_not():
     obs, row_key = stacks(4), torch.arange(4)
     for mode, same in (("resample", False), ("emission", True)):
         corruption = BatchCorruption(CorruptionConfig.of("patch", mode), seed=0)
@@ -120,7 +120,7 @@ def test_resample_draws_anew_and_emission_never_does():
     assert torch.equal(a(obs.clone(), row_key), b(obs.clone(), row_key))
 
 
-def test_a_key_stream_goes_on_from_its_position():
+def test_key_stream_continues_from_its_position():
     whole = KeyStream(1).take((10,))
     stream = KeyStream(1, position=4)
     assert torch.equal(stream.take((6,)), whole[4:])
@@ -128,7 +128,7 @@ def test_a_key_stream_goes_on_from_its_position():
     assert not torch.equal(KeyStream(2).take((10,)), whole)
 
 
-def test_unknown_and_impossible_corruptions_are_refused():
+def test_invalid_corruptions_are_rejected():
     with pytest.raises(UserError, match="unknown corruption 'fog': choose one of patch, zero_frames"):
         make_corruption("fog")
     for name in ("zero_frames+patch", "patch+patch", "zero_frames+zero_frames"):
@@ -158,8 +158,8 @@ def test_random_shift_equals_padding_and_cropping():
     assert random_shift(obs, key, pad=0) is obs
 
 
-def test_random_shift_is_drqs_interpolation_but_for_its_rounding():
-    """DrQ-v2's own lines, with given shifts: at whole pixels its weights are 0 and 1 up to float32's precision."""
+def test_random_shift_matches_drq_interpolation():
+    """DrQ-v2's code with given shifts: at integer shifts its weights are 0 and 1 up to float32 precision."""
     obs, key, pad = stacks(32), torch.arange(32), 4
     padded = torch.nn.functional.pad(obs.float(), (pad,) * 4, mode="replicate")
     side = 84 + 2 * pad
@@ -174,14 +174,14 @@ def test_random_shift_is_drqs_interpolation_but_for_its_rounding():
 
 @pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84)])
 @pytest.mark.parametrize("pad", [1, 4])
-def test_both_ways_to_shift_agree(shape, pad):
+def test_shift_implementations_agree(shape, pad):
     obs = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     offset = draw_integers(torch.arange(shape[0]), 2 * pad + 1, 2) - pad
     expected = shift_by_index(obs, offset)
     assert torch.equal(random_shift(obs, torch.arange(shape[0]), pad), expected)
 
 
-def test_shifting_some_of_the_images_by_lines_leaves_out_the_others():
+def test_shift_by_lines_of_selected_images():
     obs, some = stacks(8), torch.tensor([7, 2, 0, 2])
     offset = torch.tensor([[4, 4], [-4, 3], [-4, -4], [0, -1]])
     out = torch.empty_like(obs[some])
@@ -190,7 +190,7 @@ def test_shifting_some_of_the_images_by_lines_leaves_out_the_others():
 
 
 @pytest.mark.parametrize("name", ["none", "bars+wide", "patch+"])
-def test_a_stage_is_not_called_as_none_or_several_are(name):
+def test_reserved_stage_names_are_rejected(name):
     with (
         STAGES.isolated(),
         pytest.raises(UserError, match=re.escape(f"corruption '{name}': 'none' and names with '+'")),
@@ -199,7 +199,7 @@ def test_a_stage_is_not_called_as_none_or_several_are(name):
 
 
 @pytest.mark.parametrize(("zeroed", "older"), [(1, 1 / 2), (2, 1)])
-def test_the_newest_frame_can_be_kept_and_the_older_ones_are_zeroed_equally_often(zeroed, older):
+def test_zero_frames_can_keep_the_newest_frame(zeroed, older):
     config = CorruptionConfig.of("zero_frames", zeroed_frames=zeroed, keep_newest=True)
     out = make_corruption(config)(stacks(1).expand(3000, -1, -1, -1), torch.arange(3000))
     blank = (out.view(3000, 3, -1) == 0).all(2).float()
@@ -212,8 +212,8 @@ def test_the_newest_frame_can_be_kept_and_the_older_ones_are_zeroed_equally_ofte
 
 @pytest.mark.parametrize(("kept", "age"), [("newest", 0), ("oldest", 2)])
 @pytest.mark.parametrize("name", ["truncate", "patch+truncate"])
-def test_what_a_truncated_row_shows_is_one_frame_of_its_age(dataset, name, kept, age):
-    """In frames: row t shows frame t, or t - 2 alone, an episode's first frame standing for those before it."""
+def test_truncated_rows_show_the_newest_or_oldest_frame(dataset, name, kept, age):
+    """Row t shows only frame t or t - 2; an episode's first frame replaces missing ones."""
     view = View(dataset, CorruptionConfig.of(name, "emission", kept=kept))
     rows, plain = torch.arange(dataset.num_rows), dataset.frames
     before = view.observe(rows).clone()
@@ -226,7 +226,7 @@ def test_what_a_truncated_row_shows_is_one_frame_of_its_age(dataset, name, kept,
     dataset.frames = plain
 
 
-def test_truncation_ends_a_name_and_knows_two_frames():
+def test_invalid_truncations_are_rejected():
     with pytest.raises(UserError, match="--kept 'middle': choose one of newest, oldest"):
         make_corruption(CorruptionConfig.of("truncate", kept="middle"))
     for name in ("truncate+patch", "zero_frames+truncate", "truncate+zero_frames"):
@@ -234,15 +234,15 @@ def test_truncation_ends_a_name_and_knows_two_frames():
             CorruptionConfig.of(name)
 
 
-def test_what_was_recorded_before_frames_could_be_kept_has_the_same_settings():
+def test_keep_newest_default_is_not_recorded():
     old = {"corruption": "zero_frames", "corruption_mode": "resample", "zeroed_frames": 2}
     assert settings_of(flat(CorruptionConfig.of("zero_frames"))) == old
     assert settings_of(flat(CorruptionConfig.of("zero_frames", keep_newest=True))) == old | {"keep_newest": True}
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)
-def test_a_device_that_shifts_otherwise_makes_the_same_observations(dataset, monkeypatch, name):
-    """On a GPU whole stacks are read and shifted by index."""
+def test_shift_by_index_gives_the_same_observations(dataset, monkeypatch, name):
+    """A GPU shifts whole stacks by index."""
     rows, seen = torch.arange(dataset.num_rows).view(2, -1), []
     for by_lines in (True, False):
         if not by_lines:

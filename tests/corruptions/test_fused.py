@@ -1,4 +1,4 @@
-"""What a GPU does in one pass over the pixels, against what a CPU does line by line."""
+"""The fused single pass of a GPU against the line-by-line implementation of a CPU."""
 
 import shutil
 from functools import partial
@@ -24,7 +24,7 @@ OPTIONS = [
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
-    """Episodes of random pixels, higher than wide, no power of two."""
+    """Episodes of random 23 x 17 pixels: not square, no power of two."""
     folder = tmp_path_factory.mktemp("fused")
     dataset = open_dataset(write_fake_set(folder / "set", [9, 5, 12]), folder / "cache")
     g = torch.Generator().manual_seed(0)
@@ -33,14 +33,14 @@ def dataset(tmp_path_factory) -> Dataset:
 
 
 def seen(dataset: Dataset, config: CorruptionConfig, **settings) -> list[torch.Tensor]:
-    """Two batches of windows, one of rows."""
+    """Two batches of windows and one of rows."""
     view, device = View(dataset, config, seed=3, **settings), dataset.t.device
     rows = torch.arange(24, device=device).view(4, 6)
     return [view.observe(part).cpu().clone() for part in (rows, rows.flip(0), rows[1])]
 
 
-def expected_and_painted(dataset: Dataset, monkeypatch, config: CorruptionConfig, **settings) -> None:
-    """The same pixels, whichever way they are made."""
+def assert_fused_equals_staged(dataset: Dataset, monkeypatch, config: CorruptionConfig, **settings) -> None:
+    """Assert that both implementations give the same pixels."""
     expected = seen(dataset, config, **settings)
     with monkeypatch.context() as m:
         m.setattr(hardware, "in_host_memory", lambda x: False)
@@ -52,11 +52,11 @@ def expected_and_painted(dataset: Dataset, monkeypatch, config: CorruptionConfig
 @pytest.mark.parametrize("name", CORRUPTIONS)
 @pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("mode", ["resample", "emission"])
-def test_one_pass_makes_the_same_observations(dataset, monkeypatch, name, options, mode):
+def test_fused_observations_equal_staged_ones(dataset, monkeypatch, name, options, mode):
     config = CorruptionConfig.fill({"corruption": name, "corruption_mode": mode} | options)
     for pad in (0, 4, 16):
         for shared in ("window", "observation"):
-            expected_and_painted(dataset, monkeypatch, config, shift=pad, shared=shared)
+            assert_fused_equals_staged(dataset, monkeypatch, config, shift=pad, shared=shared)
 
 
 DROPS = [
@@ -68,19 +68,19 @@ DROPS = [
 
 
 @pytest.mark.parametrize(("name", "options"), DROPS)
-def test_one_pass_drops_the_same_frames(dataset, monkeypatch, name, options):
+def test_fused_frame_drops_equal_staged_ones(dataset, monkeypatch, name, options):
     for pad in (0, 4):
-        expected_and_painted(dataset, monkeypatch, CorruptionConfig.of(name, **options), shift=pad)
+        assert_fused_equals_staged(dataset, monkeypatch, CorruptionConfig.of(name, **options), shift=pad)
 
 
-def test_stacks_of_any_number_of_frames_are_made_in_one_pass(dataset, monkeypatch):
+def test_fused_observations_of_any_stack_size(dataset, monkeypatch):
     config = CorruptionConfig.of("patch+zero_frames", zeroed_frames=1, patch_size=4)
     for stack in (1, 2, 5):
-        expected_and_painted(dataset, monkeypatch, config, shift=3, frame_stack=stack)
+        assert_fused_equals_staged(dataset, monkeypatch, config, shift=3, frame_stack=stack)
 
 
-def test_equal_draws_zero_the_same_frames_by_ranks_as_by_sorting(monkeypatch):
-    """They hardly ever are equal: of 31 bits each."""
+def test_ranks_break_ties_as_sorting_does(monkeypatch):
+    """Ties are rare, since draws have 31 bits."""
     draws = torch.cartesian_prod(*[torch.arange(3)] * 3)
     for module in (fused, corruption):
         monkeypatch.setattr(module, "drop_order", lambda drop, key, stages, stack: draws)
@@ -92,8 +92,8 @@ def test_equal_draws_zero_the_same_frames_by_ranks_as_by_sorting(monkeypatch):
         assert torch.equal(torch.zeros_like(by_rank).scatter_(1, kept, True), by_rank)
 
 
-def test_torch_compiles_one_pass_as_a_whole_and_to_the_same_bits(dataset, monkeypatch):
-    """A GPU compiles all of it; here its operators are traced, and those on pixels compiled if there is a compiler."""
+def test_fused_observations_compile_to_equal_bits(dataset, monkeypatch):
+    """A GPU compiles the pass; here it is traced, and its pixel operators are compiled if a compiler exists."""
     monkeypatch.setattr(hardware, "in_host_memory", lambda x: False)
     config = CorruptionConfig.of("patch+zero_frames", patch_size=5, patch_count=2, patch_fill=7, keep_newest=True)
     rows = torch.arange(24).view(4, 6)
@@ -107,7 +107,7 @@ def test_torch_compiles_one_pass_as_a_whole_and_to_the_same_bits(dataset, monkey
     assert torch.equal(View(dataset, config, 4).observe(rows), expected)
 
 
-def test_what_cannot_be_compiled_runs_as_it_is_written_and_that_is_told_once(monkeypatch, capsys):
+def test_compile_failure_warns_once(monkeypatch, capsys):
     def refuse(function):
         raise RuntimeError("no compiler\nand more")
 
@@ -120,7 +120,7 @@ def test_what_cannot_be_compiled_runs_as_it_is_written_and_that_is_told_once(mon
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(("name", "options"), [*((name, one) for name in CORRUPTIONS for one in OPTIONS), *DROPS])
-def test_a_gpu_makes_the_observations_of_a_cpu(dataset, capsys, name, options):
+def test_gpu_observations_equal_cpu_observations(dataset, capsys, name, options):
     config = CorruptionConfig.fill({"corruption": name} | options)
     for settings in ({"shift": 0}, {"shift": 4}, {"shift": 4, "shared": "observation"}, {"shift": 16}):
         here = seen(dataset, config, **settings)
@@ -143,8 +143,8 @@ def samplers(dataset: Dataset, config: CorruptionConfig) -> list[WindowSampler |
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("mode", ["resample", "emission"])
-def test_a_gpu_samples_the_batches_of_a_cpu_without_waiting_also_as_a_graph(dataset, mode):
-    """Keys go on within a graph: each replay samples the next batch."""
+def test_gpu_batches_equal_cpu_batches_without_synchronising(dataset, mode):
+    """Keys advance within the graph: each replay samples the next batch."""
     config, steps = CorruptionConfig.of("patch+zero_frames", mode, patch_size=5), 12
     expected = [[s.sample().to("cpu").replace() for _ in range(steps)] for s in samplers(dataset, config)]
     try:
@@ -163,7 +163,7 @@ def test_a_gpu_samples_the_batches_of_a_cpu_without_waiting_also_as_a_graph(data
             replay = Replay(step, torch.device("cuda"), [sampler.draws])
             found = []
             for number in range(steps):
-                # the first step compiles, and a block of draws is sent now and then: neither is part of sampling
+                # compilation in the first step and occasional blocks of draws may synchronise
                 torch.cuda.set_sync_debug_mode("error" if 0 < number < 3 else "default")
                 replay(0)
                 torch.cuda.set_sync_debug_mode("default")
@@ -178,8 +178,8 @@ def test_a_gpu_samples_the_batches_of_a_cpu_without_waiting_also_as_a_graph(data
 
 
 @pytest.mark.parametrize("mode", ["resample", "emission"])
-def test_a_replayed_sampler_gives_the_batches_of_one_that_is_run(dataset, monkeypatch, mode):
-    """On a CPU a recorder plays the graph's part, and refuses what would wait for a GPU."""
+def test_replayed_sampler_equals_eager_sampler(dataset, monkeypatch, mode):
+    """A recorder stands in for the graph, and rejects operations that would synchronise."""
     config, steps = CorruptionConfig.of("patch+zero_frames", mode, patch_size=5), 8
     expected = [[s.sample() for _ in range(steps)] for s in samplers(dataset, config)]
     expected = [[{name: batch[name].clone() for name in batch} for batch in batches] for batches in expected]

@@ -1,4 +1,4 @@
-"""What `test_processes` runs: vectors of environments before and after the parent has rendered, then an optimiser."""
+"""Run by `test_processes`: vector environments before and after the parent has rendered, then an optimiser."""
 
 import importlib.util
 import sys
@@ -37,12 +37,12 @@ def refused(name: str) -> bool:
 
 if __name__ == "__main__":
     torch.set_num_threads(2)
-    torch.rand(1000, 1000).exp().sum()  # on two threads, which a forked process does not inherit
+    torch.rand(1000, 1000).exp().sum()  # starts two threads, which a forked process does not inherit
     for name in (TASK, MAZE, GYMNASIUM):
         walk(name, "fork")
     gymnasium.make(TASK).reset(seed=0)
     assert all(refused(name) for name in (TASK, MAZE, GYMNASIUM))
-    walk(TASK, "spawn")  # which inherits nothing: one kind of environment stands for all
+    walk(TASK, "spawn")  # inherits nothing, so one kind of environment suffices
     # An optimiser imports Triton: if Mesa had loaded its LLVM first, this would be a segmentation fault.
     torch.optim.Adam([torch.zeros(1, requires_grad=True)])
     assert importlib.util.find_spec("triton") is None or "triton" in sys.modules

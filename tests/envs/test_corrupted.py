@@ -1,4 +1,4 @@
-"""Frames that no agent sees need not be drawn; what it sees is the same to the bit."""
+"""Frames that no agent sees are not rendered; observations stay bit-identical."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ROWS = 40
 def episode(
     name: str, draws: Drawn, task: str = "walker_walk", **options
 ) -> tuple[list[torch.Tensor], list[float], int]:
-    """What an agent sees, its rewards, and how many frames were drawn."""
+    """Observations, rewards, and the number of rendered frames."""
     env, rng = (
         CorruptedEnv(TASKS[task], CorruptionConfig.of(name, **options), length=ROWS, draws=draws),
         np.random.default_rng(0),
@@ -28,7 +28,7 @@ def episode(
 
 
 @pytest.mark.parametrize("name", ["none", "patch", "zero_frames", "patch+zero_frames"])
-def test_what_is_seen_does_not_depend_on_what_else_is_drawn(name):
+def test_skipping_hidden_frames_does_not_change_observations(name):
     everything, rewards, drawn = episode(name, "all")
     seen, same_rewards, fewer = episode(name, "seen")
     assert torch.equal(torch.stack(seen), torch.stack(everything))
@@ -38,15 +38,15 @@ def test_what_is_seen_does_not_depend_on_what_else_is_drawn(name):
 
 
 @pytest.mark.parametrize("options", [{"kept": "newest"}, {"kept": "oldest"}])
-def test_a_stack_of_one_frame_is_seen_whole_and_draws_that_frame_alone(options):
-    """The newest of a row, or the one of two rows before: each frame is seen once, an episode's first twice more."""
+def test_truncated_stacks_show_one_frame(options):
+    """The stack's only frame is the newest one or the one of two rows before."""
     everything, seen = (episode("truncate", draws, **options) for draws in ("all", "seen"))
     assert torch.equal(torch.stack(seen[0]), torch.stack(everything[0]))
     assert [int(obs.flatten(1).any(1).view(3, 3).any(1).sum()) for obs in seen[0]] == [1] * (ROWS + 1)
     assert seen[2] <= everything[2]
 
 
-def test_nothing_is_drawn_where_nothing_is_looked_at():
+def test_unobserved_environments_render_nothing():
     shown, rewards, drawn = episode("patch", "nothing")
     assert drawn == 0
     assert {obs.numel() for obs in shown} == {0}

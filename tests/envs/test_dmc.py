@@ -26,7 +26,7 @@ def name_of(env):
     return next(name for name, task in TASKS.items() if task == env.task)
 
 
-def test_rewards_replay_exactly_from_the_first_stored_state(blind):
+def test_rewards_replay_exactly(blind):
     for seed in (3, 4):  # the second episode starts from a used simulator
         rows, actions = roll(blind, seed, 200)
         replayed = replay_rewards(name_of(blind), rows[0].physics, actions)
@@ -34,13 +34,13 @@ def test_rewards_replay_exactly_from_the_first_stored_state(blind):
         np.testing.assert_array_equal(replayed, [row.reward for row in rows[1:]])
 
 
-def test_what_an_actor_reads_is_found_in_stored_states(blind):
+def test_observed_states_are_recovered_from_physics(blind):
     rows, _ = roll(blind, 3, 20)
     found = observed_states(blind.task, np.stack([row.physics for row in rows]))
     np.testing.assert_allclose(found, np.stack([row.state for row in rows]), atol=1e-5)
 
 
-def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
+def test_dmc_action_repeat_sums_rewards(blind):
     start = blind.reset(0).physics
     action = np.full(blind.action_dim, 0.5, np.float32)
     row = blind.step(action)
@@ -52,14 +52,14 @@ def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
     assert not np.array_equal(row.physics, start)
 
 
-def test_only_the_time_limit_ends_an_episode_and_its_discount_stays_one():
+def test_time_limit_keeps_discount_one():
     env = DMCEnv(TASKS["walker_walk"], size=None)
     rows, _ = roll(env, 0, EPISODE_TRANSITIONS)
     assert [row.last for row in rows] == [False] * EPISODE_TRANSITIONS + [True]
     assert rows[-1].discount == 1.0
 
 
-def test_another_process_renders_the_same_bytes():
+def test_rendering_is_equal_across_processes():
     code = (
         "import sys; from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.core.tasks import TASKS;"
         "env = make_env(TASKS['walker_walk']);"

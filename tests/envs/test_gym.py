@@ -21,7 +21,7 @@ def make(name, **arguments):
 
 
 @pytest.mark.parametrize("name", ["WalkerWalk", "MazeNoCurtain"])
-def test_an_action_of_another_shape_or_no_number_is_refused(name):
+def test_invalid_actions_are_rejected(name):
     env = make(name)
     env.reset(seed=0)
     for action in (np.ones(1), np.ones(env.action_space.shape[0] + 1), np.full(env.action_space.shape, np.nan)):
@@ -29,7 +29,7 @@ def test_an_action_of_another_shape_or_no_number_is_refused(name):
             env.unwrapped.step(action)
 
 
-def test_what_is_shown_clean_is_a_copy():
+def test_clean_observation_is_a_copy():
     env = make("WalkerWalk")
     obs, info = env.reset(seed=0)
     obs[:] = 0
@@ -37,7 +37,7 @@ def test_what_is_shown_clean_is_a_copy():
 
 
 @pytest.mark.parametrize("name", [name for name in GYM_IDS if "Walker" in name or name.count("-") == 1])
-def test_every_id_passes_gymnasiums_checker(name):
+def test_ids_pass_the_gymnasium_checker(name):
     env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # Gymnasium's kind
@@ -45,7 +45,7 @@ def test_every_id_passes_gymnasiums_checker(name):
     env.close()
 
 
-def test_stacks_repeat_the_first_frame_and_put_the_oldest_first():
+def test_frame_stack_order_and_padding():
     env = make("WalkerWalk")
     obs, info = env.reset(seed=0)
     first = obs[:3]
@@ -59,7 +59,7 @@ def test_stacks_repeat_the_first_frame_and_put_the_oldest_first():
     np.testing.assert_array_equal(env.render(), third[6:].transpose(1, 2, 0))
 
 
-def test_the_time_limit_truncates():
+def test_time_limit_truncates():
     env = make("WalkerWalk", max_episode_steps=3)
     env.reset(seed=0)
     ends = [env.step(np.zeros(6, np.float32))[2:4] for _ in range(3)]
@@ -73,7 +73,7 @@ EVERY_ID = {
 }
 
 
-def test_every_id_tells_its_time_limit():
+def test_ids_have_their_time_limits():
     ours = [name for name in gymnasium.registry if name.startswith("vd4rl_pomdp/")]
     assert {name: gymnasium.spec(name).max_episode_steps for name in ours} == EVERY_ID
 
@@ -81,7 +81,7 @@ def test_every_id_tells_its_time_limit():
 @pytest.mark.parametrize(
     "name", ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeFirstPerson-v0", "vd4rl_pomdp/ForwardJumpCounterexample-v0"]
 )
-def test_a_step_after_the_end_is_refused_until_reset(name):
+def test_step_after_the_end_needs_reset(name):
     made = gymnasium.make(name, max_episode_steps=2)
     for env in (made, gymnasium.make(made.spec)):
         for seed in (0, None):
@@ -92,7 +92,7 @@ def test_a_step_after_the_end_is_refused_until_reset(name):
                 env.step(action)
 
 
-def test_patches_cover_256_pixels_of_each_frame_and_zero_frames_leaves_one():
+def test_patch_and_zero_frames_ids_corrupt_observations():
     env = make("WalkerWalk-Patch16")
     obs, info = env.reset(seed=0)
     changed = (obs != info["clean"]).reshape(3, 3, -1).any(1).sum(1)
@@ -105,7 +105,7 @@ def test_patches_cover_256_pixels_of_each_frame_and_zero_frames_leaves_one():
     np.testing.assert_array_equal(obs.reshape(3, 3, 84, 84)[kept], info["clean"].reshape(3, 3, 84, 84)[kept])
 
 
-def test_a_seed_fixes_the_series_and_every_episode_has_its_own_state_and_masks():
+def test_seed_fixes_states_and_masks_of_a_series_of_episodes():
     env = make("WalkerWalk-Patch16")
     series = [[env.reset(seed=7), env.reset()] for _ in range(2)]
     for (obs, info), (same_obs, same_info) in zip(*series, strict=True):
@@ -117,7 +117,7 @@ def test_a_seed_fixes_the_series_and_every_episode_has_its_own_state_and_masks()
 
 
 @pytest.mark.parametrize("name", ["patch", "zero_frames", "patch+zero_frames"])
-def test_the_environment_corrupts_a_row_as_a_batch_would(name):
+def test_environment_and_batch_corrupt_equally(name):
     env = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of(name), length=4)
     steps = [env.reset(1, corruption_seed=5, episode=2)] + [env.step(np.zeros(6, np.float32)) for _ in range(3)]
     keys = derive_keys(5, row_key(torch.tensor([2]), torch.arange(4)))
@@ -126,7 +126,7 @@ def test_the_environment_corrupts_a_row_as_a_batch_would(name):
     assert not torch.equal(batch[0], steps[0].clean)
 
 
-def test_the_corruptions_fields_are_arguments():
+def test_corruption_options_are_arguments():
     env = make("WalkerWalk", corruption="patch", patch_size=24, patch_count=1, patch_fill=255, patch_shared=True)
     obs, info = env.reset(seed=0)
     changed = (obs != info["clean"]).reshape(3, 3, -1).any(1)
@@ -146,6 +146,6 @@ def test_the_corruptions_fields_are_arguments():
         ({"corruption": "zero_frames", "zeroed_frames": 4}, "cannot zero 4 of 3"),
     ],
 )
-def test_bad_arguments_are_refused(arguments, message):
+def test_invalid_arguments_are_rejected(arguments, message):
     with pytest.raises(UserError, match=message):
         make("WalkerWalk", **arguments)

@@ -12,7 +12,7 @@ from vd4rl_pomdp.envs.rendering import mujoco
 
 
 class Counter(gymnasium.Env):
-    """Shows how many steps were made, in grey; pays 1, 2, 3, ... and ends as told."""
+    """Shows the number of steps as a grey level; rewards are 1, 2, 3, ..., and `end` is the last step."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
@@ -50,7 +50,7 @@ def play(task, decisions, **options):
 
 @pytest.mark.parametrize("pixels", ["render", "observation"])
 @pytest.mark.parametrize("shape", [(20, 30), (20, 30, 1), (20, 30, 3), (3, 20, 30), (1, 20, 30), (16, 16, 3)])
-def test_pictures_of_every_layout_become_frames(pixels, shape):
+def test_images_of_any_layout_become_frames(pixels, shape):
     _, rows = play(GymnasiumTask(Counter, {"shape": shape}, pixels=pixels), 2, size=16)
     for t, row in enumerate(rows):
         assert (row.frame.dtype, row.frame.shape) == (np.uint8, (3, 16, 16))
@@ -58,7 +58,7 @@ def test_pictures_of_every_layout_become_frames(pixels, shape):
 
 
 def exact_means(picture: np.ndarray, size: int) -> np.ndarray:
-    """Means over blocks of a picture in which each pixel stands so often that a block is a new pixel; halves go up."""
+    """Block means of the image after upsampling to a common multiple of both sizes; halves are rounded up."""
     tall, wide = (np.lcm(old, size) for old in picture.shape[:2])
     fine = picture.repeat(tall // picture.shape[0], 0).repeat(wide // picture.shape[1], 1)
     sums = fine.reshape(size, tall // size, size, wide // size, 3).sum((1, 3), dtype=np.int64)
@@ -70,13 +70,13 @@ NOT_WHOLE = [(120, 120), (480, 480), (100, 100), (85, 85), (168, 120), (90, 168)
 
 
 @pytest.mark.parametrize("shape", NOT_WHOLE, ids=str)
-def test_pixels_of_a_frame_are_means_of_the_areas_that_they_cover(shape):
+def test_area_means_match_exact_means(shape):
     picture = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     assert np.array_equal(area_means(picture, 84), exact_means(picture, 84))
 
 
 class OneBuffer(Counter):
-    """Draws every picture into the same memory."""
+    """Renders every image into the same memory."""
 
     def picture(self):
         self.buffer = getattr(self, "buffer", np.empty(self.shape, np.uint8))
@@ -85,15 +85,15 @@ class OneBuffer(Counter):
 
 
 @pytest.mark.parametrize("shape", [(3, 16, 16), (16, 16, 3), (16, 16)])
-def test_a_row_keeps_its_frame_where_an_environment_draws_into_one_buffer(shape):
+def test_frames_are_copied_from_reused_buffers(shape):
     _, rows = play(GymnasiumTask(OneBuffer, {"shape": shape}, pixels="observation"), 2, size=16)
     for t, row in enumerate(rows):
         assert (row.frame == t).all()
         assert row.frame.flags.c_contiguous
 
 
-def test_another_environment_in_the_process_changes_no_picture():
-    """Gymnasium draws into whatever context is current, if the environment has one viewer."""
+def test_gymnasium_frames_do_not_depend_on_other_environments():
+    """Gymnasium renders into the current OpenGL context if the environment has one viewer."""
 
     def three_frames(between=lambda: None):
         env = make_env(GymnasiumTask("HalfCheetah-v5"))
@@ -110,19 +110,19 @@ def test_another_environment_in_the_process_changes_no_picture():
         others.append(make_env(TASKS["walker_walk"]))
         others[-1].reset(1)
 
-    alone = three_frames()
-    assert (alone[0] != alone[-1]).any()
-    np.testing.assert_array_equal(three_frames(draw_a_walker), alone)
+    expected = three_frames()
+    assert (expected[0] != expected[-1]).any()
+    np.testing.assert_array_equal(three_frames(draw_a_walker), expected)
 
 
-def test_an_action_is_repeated_and_its_rewards_summed():
+def test_actions_are_repeated_and_rewards_summed():
     _, rows = play(GymnasiumTask(Counter, action_repeat=3), 2)
     assert [row.reward for row in rows] == [0, 1 + 2 + 3, 4 + 5 + 6]
     assert (rows[2].frame == 6).all()
 
 
 @pytest.mark.parametrize(("truncates", "discount"), [(False, 0.0), (True, 1.0)])
-def test_an_end_within_the_repeat_ends_the_episode(truncates, discount):
+def test_episode_end_within_action_repeat(truncates, discount):
     _, rows = play(GymnasiumTask(Counter, {"end": 5, "truncates": truncates}, action_repeat=3), 2)
     assert [row.step_type for row in rows] == [StepType.FIRST, StepType.MID, StepType.LAST]
     assert [row.discount for row in rows] == [1.0, 1.0, discount]
@@ -131,7 +131,7 @@ def test_an_end_within_the_repeat_ends_the_episode(truncates, discount):
 
 
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-3.0, 5.0), (0.0, 0.5)])
-def test_actions_reach_the_environments_bounds_in_its_shape(low, high):
+def test_actions_are_scaled_and_reshaped(low, high):
     env = make_env(GymnasiumTask(Counter, {"low": low, "high": high}))
     env.reset(0)
     for action in ([-1, 1], [0, 2], [0.1, -0.7]):
@@ -143,11 +143,11 @@ def test_actions_reach_the_environments_bounds_in_its_shape(low, high):
         np.testing.assert_array_equal(env.env.actions[2].ravel(), np.array([0.1, -0.7], np.float32))
 
 
-def test_an_environment_is_made_by_its_id_with_its_arguments():
+def test_environment_is_made_by_id_and_arguments():
     gymnasium.register("vd4rl_pomdp_test/Counter-v0", entry_point=Counter, max_episode_steps=4)
     try:
         _, rows = play(GymnasiumTask("vd4rl_pomdp_test/Counter-v0", {"end": 9}), 4)
-        assert (rows[4].last, rows[4].discount) == (True, 1.0), "its own limit of time truncates"
+        assert (rows[4].last, rows[4].discount) == (True, 1.0), "the environment's time limit truncates"
     finally:
         gymnasium.registry.pop("vd4rl_pomdp_test/Counter-v0")
 
@@ -165,14 +165,14 @@ def test_an_environment_is_made_by_its_id_with_its_arguments():
         ({"shape": (0, 30, 3)}, r"Counter returns uint8 of shape \(0, 30, 3\)"),
     ],
 )
-def test_what_can_be_no_task_is_one_line(arguments, message):
+def test_unsupported_environments_are_rejected(arguments, message):
     with pytest.raises(UserError, match=message) as caught:
         play(GymnasiumTask(Counter, arguments), 0)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("place", ["reset", "step", "render"])
-def test_what_an_environment_misses_later_is_one_line_too(place):
+def test_late_missing_dependency_is_reported(place):
     class Needy(Counter):
         pass
 
@@ -187,7 +187,7 @@ def test_what_an_environment_misses_later_is_one_line_too(place):
     assert "\n" not in str(caught.value)
 
 
-def test_the_corrupted_environment_tells_who_ended_an_episode():
+def test_termination_and_truncation_are_distinguished():
     with TASKS.isolated():
         TASKS.register("ending", GymnasiumTask(Counter, {"end": 2}))
         TASKS.register("cut", GymnasiumTask(Counter, {"end": 2, "truncates": True}))
@@ -204,7 +204,7 @@ def test_the_corrupted_environment_tells_who_ended_an_episode():
             GymEnv(name, frame_size=8)
 
 
-def test_a_task_of_dm_control_that_ends_has_discount_0(monkeypatch):
+def test_terminating_dm_control_task_has_discount_0(monkeypatch):
     env = make_env(DMCTask("pendulum", "swingup"), size=None)
     env.reset(0)
     monkeypatch.setattr(env.simulator.task, "get_termination", lambda physics: 0.0)
@@ -222,19 +222,19 @@ class Failing(Counter):
         return len(seed)
 
 
-def test_an_environment_whose_reset_takes_no_seed_is_one_line():
+def test_environment_without_seed_is_rejected():
     env = make_env(GymnasiumTask(Seedless))
     with pytest.raises(
         UserError, match=r"Seedless cannot be reset with a seed \(.* 'seed'\): give it Gymnasium's"
     ) as caught:
         env.reset(0)
     assert "\n" not in str(caught.value)
-    with pytest.raises(TypeError, match="has no len"):  # a fault of its own stays what it is
+    with pytest.raises(TypeError, match="has no len"):  # the environment's own defects are not converted
         make_env(GymnasiumTask(Failing)).reset(0)
 
 
 @pytest.mark.parametrize(
-    ("told", "rate"),
+    ("attributes", "rate"),
     [
         ({"metadata": {"render_fps": 20}}, 10),
         ({"metadata": {}}, 15),
@@ -243,13 +243,13 @@ def test_an_environment_whose_reset_takes_no_seed_is_one_line():
         ({"metadata": {"render_fps": 20}, "dt": None}, 10),
     ],
 )
-def test_a_task_is_as_fast_as_its_time_step_tells_before_its_metadata(told, rate):
-    env = make_env(GymnasiumTask(type("Timed", (Counter,), told), action_repeat=2))
+def test_frame_rate_prefers_time_step_over_metadata(attributes, rate):
+    env = make_env(GymnasiumTask(type("Timed", (Counter,), attributes), action_repeat=2))
     assert env.rate == pytest.approx(rate)
 
 
-def test_gymnasiums_cheetah_is_drawn_one_simulator_step_late():
-    """As docs/add_a_task.md says."""
+def test_gymnasium_cheetah_renders_one_simulator_step_late():
+    """As documented in docs/add_a_task.md."""
     env = make_env(GymnasiumTask("HalfCheetah-v5"), size=None)
     env.reset(0)
     model, data = env.env.unwrapped.model, env.env.unwrapped.data

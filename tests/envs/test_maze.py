@@ -15,7 +15,7 @@ FIRST_PERSON = [name for name, spec in MAZES.items() if spec.first_person]
 
 
 def states_of(maze: str, count: int, hidden: bool, env: MazeEnv, rng: np.random.Generator) -> list[np.ndarray]:
-    """Free states with random velocities, wholly under a curtain or not."""
+    """Free states with random velocities, either fully under a curtain or not."""
     found: list[np.ndarray] = []
     while len(found) < count:
         state = np.concatenate([rng.uniform(-1.5, 1.5, 2), rng.uniform(-5, 5, 2)])
@@ -25,13 +25,13 @@ def states_of(maze: str, count: int, hidden: bool, env: MazeEnv, rng: np.random.
 
 
 @pytest.mark.parametrize("maze", PAPER_MAZES)
-def test_registered_mazes_pass_gymnasiums_checker(maze):
+def test_mazes_pass_the_gymnasium_checker(maze):
     env = gymnasium.make(MAZES[maze].gym_id, render_mode="rgb_array")
     check_env(env.unwrapped)
 
 
 @pytest.mark.parametrize("maze", PAPER_MAZES)
-def test_a_seed_fixes_everything(maze):
+def test_mazes_are_seeded(maze):
     def run(seed: int) -> tuple[bytes, np.ndarray]:
         env = MazeEnv(maze)
         obs, info = env.reset(seed=seed)
@@ -47,11 +47,11 @@ def test_a_seed_fixes_everything(maze):
 
 
 @pytest.mark.parametrize("maze", ["three_curtains", "hard_three_curtains"])
-def test_seen_from_the_top_the_dynamics_are_pointmazes_own(maze, tmp_path, monkeypatch):
-    """The generator limits velocities once a decision, PointMaze and the hard mazes before every step."""
+def test_top_view_dynamics_match_pointmaze(maze, tmp_path, monkeypatch):
+    """The generator clips velocities once per decision, PointMaze and the hard mazes before every step."""
     import gymnasium_robotics
 
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where PointMaze leaves its model
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # PointMaze leaves its model there
     gymnasium.register_envs(gymnasium_robotics)
     theirs = gymnasium.make("PointMaze_UMaze-v3").unwrapped
     theirs.reset(seed=0)
@@ -72,7 +72,7 @@ def test_seen_from_the_top_the_dynamics_are_pointmazes_own(maze, tmp_path, monke
         np.testing.assert_allclose(info["state"], expected, atol=1e-9)
 
 
-def test_a_push_of_a_whole_decision_leads_beyond_the_limit_unless_every_step_is_limited():
+def test_velocity_limit_applies_per_decision_or_per_step():
     reached = {}
     for maze in ("no_curtain", "hard_no_curtain"):
         env = MazeEnv(maze, pixels=False)
@@ -84,7 +84,7 @@ def test_a_push_of_a_whole_decision_leads_beyond_the_limit_unless_every_step_is_
 
 @pytest.mark.parametrize("maze", CURTAINED)
 @pytest.mark.parametrize("render", ["fast", "exact"])
-def test_states_fully_under_a_curtain_look_alike_to_the_last_bit(maze, render):
+def test_hidden_states_have_identical_observations(maze, render):
     rng = np.random.default_rng(0)
     env = MazeEnv(maze, render=render)
     env.reset(seed=0)
@@ -96,7 +96,7 @@ def test_states_fully_under_a_curtain_look_alike_to_the_last_bit(maze, render):
     assert len(pictures) == 1
 
 
-def test_states_that_no_curtain_hides_can_be_told_apart():
+def test_visible_states_have_distinct_observations():
     rng = np.random.default_rng(0)
     env = MazeEnv("three_curtains")
     env.reset(seed=0)
@@ -106,8 +106,8 @@ def test_states_that_no_curtain_hides_can_be_told_apart():
     assert not MAZES["no_curtain"].hidden(np.zeros((4, 4))).any()
 
 
-def test_every_curtain_hides_a_whole_passage():
-    """At some point of each covered corridor the mass is hidden wherever it is across the corridor."""
+def test_curtains_hide_whole_passages():
+    """Some cross-section of each covered corridor hides the mass completely."""
     maze = MAZES["hard_three_curtains"]
     across = np.linspace(-0.4, 0.4, 9)
     for states in ([(-0.25, 1 + a) for a in across], [(-0.25, -1 + a) for a in across], [(1 + a, 0) for a in across]):
@@ -116,8 +116,8 @@ def test_every_curtain_hides_a_whole_passage():
     assert 0.2 < share < 0.5
 
 
-def test_the_papers_curtains_cover_the_bend_and_both_dead_ends():
-    """One cell each; a state counts as hidden where nothing of the ball is left to see beside a curtain."""
+def test_paper_curtains_cover_the_bend_and_dead_ends():
+    """Each curtain covers one cell; a state counts as hidden if no part of the ball is visible."""
     three, one = MAZES["three_curtains"], MAZES["one_curtain"]
     ends, bend = np.array([(-1.0, 1.0), (-1.0, -1.0)]), np.array([1.0, 0.0])
     assert three.hidden(ends).all()
@@ -138,7 +138,7 @@ TOP = ["no_curtain", "three_curtains", "hard_no_curtain", "hard_three_curtains"]
 
 
 @pytest.mark.parametrize("maze", [*TOP, *FIRST_PERSON])
-def test_the_fast_picture_is_mujocos_but_for_highlights_in_first_person(maze):
+def test_fast_rendering_is_close_to_mujoco(maze):
     rng = np.random.default_rng(1)
     fast, exact = MazeEnv(maze), MazeEnv(maze, render="exact")
     fast.reset(seed=0), exact.reset(seed=0)
@@ -151,8 +151,8 @@ def test_the_fast_picture_is_mujocos_but_for_highlights_in_first_person(maze):
 
 
 @pytest.mark.parametrize("maze", ["three_curtains", "first_person"])
-def test_every_picture_is_of_the_state_that_is_told_with_it(maze):
-    """MuJoCo leaves the places of bodies as they were when its last step began."""
+def test_observations_match_their_states(maze):
+    """MuJoCo does not update body positions after its last step."""
     rng = np.random.default_rng(0)
     fast, exact, again = MazeEnv(maze), MazeEnv(maze, render="exact"), MazeEnv(maze, render="exact")
     for env in (fast, exact, again):
@@ -174,23 +174,23 @@ def test_curtains_do_not_collide_and_goals_are_not_drawn():
     assert (env.reset(seed=2, options={"state": np.array([1.2, 1.2, 0, 0])})[0] == before).all()
 
 
-def test_a_decision_in_first_person_turns_and_pushes_as_the_generators_does():
+def test_first_person_dynamics_match_the_generator():
     env = MazeEnv("first_person", pixels=False)
     env.reset(seed=0, options={"state": np.array([-1.0, 1.0, 0.7, 0.0, 0.0, 0.0])})
     _, _, _, _, info = env.step(np.array([1.0, 1.0]))
     _, _, heading, vx, vy, spin = info["state"]
     assert heading - 0.7 == pytest.approx(0.27, abs=0.005)
-    assert spin < 0.02 * 40, "what is left of the turning rate"
-    assert np.hypot(vx, vy) == pytest.approx(0.1, rel=0.02), "once a decision, whatever its length"
+    assert spin < 0.02 * 40, "remaining turning rate"
+    assert np.hypot(vx, vy) == pytest.approx(0.1, rel=0.02), "one push per decision"
     assert np.arctan2(vy, vx) == pytest.approx(0.7, abs=1e-6)
     _, _, _, _, after = env.step(np.zeros(2))
-    assert after["state"][5] == pytest.approx(spin * 0.403**5, rel=0.02), "no action: nothing is set"
+    assert after["state"][5] == pytest.approx(spin * 0.403**5, rel=0.02), "a zero action sets nothing"
     _, _, _, _, info = env.step(np.array([1.0, 0.0]))
     assert info["state"][5] == 0
 
 
-def test_cameras_and_sky_are_the_generators():
-    """From the top 30 degrees, 7 above the centre; in first person 60, in the ball, under a blue that fades."""
+def test_cameras_and_sky_match_the_generator():
+    """Top view: 30 degrees, 7 above the centre; first person: 60 degrees, in the ball, under a fading blue sky."""
     for maze, fovy, height in (("three_curtains", 30, 7), ("first_person", 60, 0)):
         model = build_simulator(MAZES[maze])[0].model
         assert (model.cam_fovy[0], model.cam_pos[0, 2]) == (fovy, height), maze
@@ -202,8 +202,8 @@ def test_cameras_and_sky_are_the_generators():
     assert 0.02 < (sky[:, 1] > ahead + 30).all(1).mean() < 0.06, "white stars"
 
 
-def test_the_sky_tells_headings_apart_where_it_is_a_compass():
-    """Over a corner that looks the same from both sides but for the light, only the sky differs."""
+def test_compass_sky_distinguishes_headings():
+    """A corner looks the same from both sides, except for lighting and the sky."""
     for maze, least in (("compass_first_person", 40), ("hard_first_person", 0)):
         env = MazeEnv(maze)
         env.reset(seed=0)
@@ -214,7 +214,7 @@ def test_the_sky_tells_headings_apart_where_it_is_a_compass():
         assert np.abs(tops[0] - tops[1]).max() >= least, maze
 
 
-def test_hard_first_person_velocities_follow_the_papers_text():
+def test_hard_first_person_dynamics_match_the_paper():
     env = MazeEnv("hard_first_person", pixels=False, action_repeat=1)
     env.reset(seed=0)
     heading = 0.7
@@ -227,7 +227,7 @@ def test_hard_first_person_velocities_follow_the_papers_text():
     assert turned - heading == pytest.approx(0.5 * 4.0 * 0.01, rel=1e-6)
 
 
-def test_goals_move_when_they_are_reached_and_are_the_points_that_stand_for_cells():
+def test_goals_are_cell_points_and_move_when_reached():
     env = MazeEnv("no_curtain", pixels=False)
     goals = set()
     for seed in range(60):
@@ -242,7 +242,7 @@ def test_goals_move_when_they_are_reached_and_are_the_points_that_stand_for_cell
     assert goals == {(x + 0.2, y - 0.2) for x, y in [(-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1)]}
 
 
-def test_a_goal_is_not_reached_in_passing_where_the_planner_halts():
+def test_goals_need_a_halt_except_in_hard_mazes():
     for maze, reward in (("no_curtain", 0.0), ("hard_no_curtain", 1.0)):
         env = MazeEnv(maze, pixels=False)
         env.reset(seed=0, options={"state": np.array([-0.3, 1.0, 5.0, 0.0])})
@@ -250,7 +250,7 @@ def test_a_goal_is_not_reached_in_passing_where_the_planner_halts():
         assert env.step(np.zeros(2))[1] == reward
 
 
-def test_a_goal_that_is_not_reached_gives_way_after_its_time():
+def test_unreached_goals_expire():
     for maze, decisions in (("first_person", 150), ("no_curtain", 150), ("hard_no_curtain", None)):
         env = MazeEnv(maze, pixels=False)
         env.reset(seed=1)
@@ -267,6 +267,6 @@ def test_a_goal_that_is_not_reached_gives_way_after_its_time():
     ("arguments", "message"),
     [({"render": "Exact"}, "unknown rendering 'Exact'"), ({"action_repeat": 0}, "--action-repeat is 0")],
 )
-def test_an_environment_that_cannot_be_is_refused(arguments, message):
+def test_invalid_maze_arguments_are_rejected(arguments, message):
     with pytest.raises(UserError, match=message):
         MazeEnv("no_curtain", **arguments)

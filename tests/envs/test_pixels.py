@@ -1,4 +1,4 @@
-"""What all kinds of tasks share: actions between bounds, and when an episode goes on."""
+"""Behaviour shared by all kinds of tasks: action scaling and steps outside an episode."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from vd4rl_pomdp.envs.pixels import between, check_bounds
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
-def test_the_extremes_are_the_bounds_in_their_dtype_and_nothing_passes_them(dtype):
+def test_scaled_actions_reach_and_respect_bounds(dtype):
     rng = np.random.default_rng(0)
     low, high = np.sort(np.round(rng.uniform(-5, 5, (2, 3000)), 2), 0).astype(dtype)
     ends = [between(end * np.ones(3000, np.float32), low, high) for end in (-1, 1)]
@@ -27,7 +27,7 @@ def test_the_extremes_are_the_bounds_in_their_dtype_and_nothing_passes_them(dtyp
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
-def test_bounds_that_bound_nothing_are_refused_in_every_dtype(dtype):
+def test_infinite_action_bounds_are_rejected(dtype):
     one = np.ones(2, dtype)
     check_bounds("it", -one, one)
     for far in (np.inf, np.nan, *([1e10] if dtype != np.float16 else [])):
@@ -36,7 +36,7 @@ def test_bounds_that_bound_nothing_are_refused_in_every_dtype(dtype):
 
 
 @pytest.mark.parametrize("task", [DMCTask("pendulum", "swingup"), GymnasiumTask("HalfCheetah-v5")])
-def test_a_step_outside_an_episode_is_refused(task):
+def test_step_outside_an_episode_is_rejected(task):
     env = make_env(task, size=None, length=1)
     action = np.zeros(env.action_dim, np.float32)
     for _ in range(2):

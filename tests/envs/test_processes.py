@@ -1,6 +1,6 @@
-"""OpenGL in several processes, and beside Triton: a process of its own, so that what hangs or dies takes no test along.
+"""OpenGL in several processes and together with Triton, in a subprocess, so that a hang or crash ends no other test.
 
-PyTorch's builds for GPUs bring Triton; beside a build without it the `dev` extra installs it.
+PyTorch's GPU builds include Triton; otherwise the `dev` extra installs it.
 """
 
 import ast
@@ -26,14 +26,14 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def test_one_module_alone_loads_opengl():
+def test_only_rendering_module_imports_mujoco():
     folders = ("vd4rl_pomdp", "pretrain", "finetune", "baselines", "tests")
     sources = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     loading = {path for path in sources if imported(path) & {"dm_control", "mujoco"}}
-    assert loading - {ENVS / "maze_renderers.py"} == {ENVS / "rendering.py"}  # the first after the second
+    assert loading - {ENVS / "maze_renderers.py"} == {ENVS / "rendering.py"}  # the former imports the latter
 
 
-def test_processes_that_work_do_and_those_that_would_hang_are_refused(tmp_path):
+def test_vector_environments_work_or_are_rejected(tmp_path):
     shown = tmp_path / "shown.txt"
     with shown.open("w") as file:
         process = subprocess.Popen(

@@ -15,7 +15,7 @@ from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.maze import MazeEnv
 
 
-def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install():
+def test_untested_mujoco_versions_are_rejected():
     for version in ("3.3.0", "3.11.0", "3.17.0"):
         rendering.check_mujoco(version)
     for version in ("3.1.6", "3.2.7", "3.18.0", "4.0.0"):
@@ -24,7 +24,7 @@ def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install():
 
 
 @pytest.mark.parametrize("task", ["walker_walk", "reacher_jump"])
-def test_a_dm_control_of_another_mujoco_is_one_line(task, monkeypatch):
+def test_incompatible_dm_control_is_reported(task, monkeypatch):
     def load(*arguments, **options):
         raise AttributeError("'MjModel' object has no attribute 'flex_evpair'")  # as of 1.0.44 with mujoco 3.17.0
 
@@ -51,7 +51,7 @@ load()
 """
 
 
-def test_a_machine_without_opengl_or_dm_control_gets_a_sentence():
+def test_missing_opengl_or_dm_control_is_reported():
     done = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, check=True)
     opengl, control = done.stdout.splitlines()
     assert re.match("cannot render with .*MUJOCO_GL=nothing.*libegl1", opengl)
@@ -77,13 +77,13 @@ COMMANDS = [
     "navigation collect --maze no_curtain --preset smoke --workers 1",
     "data collect --task walker_walk --quality random --frame-size 16 --episodes 2 --workers 2",
 ]
-"""The last one draws in spawned workers."""
+"""The last command renders in spawned workers."""
 
 
-def test_a_variable_that_opengl_cannot_use_is_one_line_for_every_kind_of_task(tmp_path):
+def test_invalid_opengl_variables_are_reported_for_all_tasks(tmp_path):
     (tmp_path / "play.py").write_text(PLAY)
     words = [f"{command} --out {tmp_path / 'set'}" for command in COMMANDS]
-    dropped = ("DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")  # the last is set where this process has drawn
+    dropped = ("DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")  # the last is set once this process has rendered
     env = {name: value for name, value in os.environ.items() if name not in dropped}
     env |= {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "0,1"}
     command = [sys.executable, tmp_path / "play.py", *words]
@@ -94,7 +94,7 @@ def test_a_variable_that_opengl_cannot_use_is_one_line_for_every_kind_of_task(tm
         assert re.match(r"error: cannot render with .*MUJOCO_EGL_DEVICE_ID=0,1.* \(.*\): correct or unset", line)
 
 
-def test_a_process_that_has_drawn_ends_without_a_word():
+def test_rendering_process_exits_silently():
     code = (
         "from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask\n"
         "names = 'HalfCheetah-v5', 'walker_walk'\n"
@@ -106,7 +106,7 @@ def test_a_process_that_has_drawn_ends_without_a_word():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_pictures_do_not_depend_on_the_size_of_the_buffer_they_are_drawn_in(task):
+def test_frames_do_not_depend_on_the_buffer_size(task):
     env = make_env(TASKS[task], "exact")
     frame = env.reset(1).frame
     other = make_env(TASKS[task], size=None).physics
@@ -127,8 +127,8 @@ def three_frames(env, between=lambda: None):
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_another_renderer_in_the_process_changes_no_picture(closed):
-    """mujoco's own, whose context dm_control does not know of: it drew nothing and read the picture before."""
+def test_frames_do_not_depend_on_other_renderers(closed):
+    """dm_control does not know the context of mujoco's renderer, and would read a stale image."""
     mazes = []
 
     def draw_a_maze():
@@ -137,8 +137,8 @@ def test_another_renderer_in_the_process_changes_no_picture(closed):
         if closed:
             mazes[-1].close()
 
-    alone = three_frames(make_env(TASKS["walker_walk"]))
-    np.testing.assert_array_equal(three_frames(make_env(TASKS["walker_walk"]), draw_a_maze), alone)
+    expected = three_frames(make_env(TASKS["walker_walk"]))
+    np.testing.assert_array_equal(three_frames(make_env(TASKS["walker_walk"]), draw_a_maze), expected)
 
 
 def draw_walker():
@@ -153,9 +153,9 @@ def draw_maze():
 
 
 @pytest.mark.parametrize("draw", [draw_walker, draw_maze])
-def test_an_environment_that_is_freed_while_another_draws_changes_no_picture(draw, monkeypatch):
-    """The garbage collector at its worst moment: a context has been made current, and nothing drawn yet."""
-    alone, context = draw()
+def test_frames_do_not_depend_on_freed_environments(draw, monkeypatch):
+    """The garbage collector runs after a context was made current and before anything is rendered."""
+    expected, context = draw()
     make_current = context.make_current
     garbage = [make_env(TASKS["cheetah_run"])]
     garbage[0].reset(1)
@@ -175,4 +175,4 @@ def test_an_environment_that_is_freed_while_another_draws_changes_no_picture(dra
             garbage.clear()
 
     monkeypatch.setattr(context, "make_current", then_collect)
-    np.testing.assert_array_equal(draw()[0], alone)
+    np.testing.assert_array_equal(draw()[0], expected)

@@ -1,4 +1,4 @@
-"""Adam's state goes from one kind of step to another, and from one memory layout to another."""
+"""Adam's state transfers between implementations and memory layouts."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from vd4rl_pomdp.runs.checkpoint import pack, unpack
 def trained(
     kind: type[Adam], steps: int, state: dict | None = None, weights: nn.Parameter | None = None, **given: bool
 ):
-    """Channels-last weights after some steps of a fixed sequence of gradients, and what moved them."""
+    """Channels-last weights after `steps` of a fixed gradient sequence, and their optimiser."""
     g = torch.Generator().manual_seed(0)
     first = torch.randn(4, 3, 2, 2, generator=g)
     if weights is None:
@@ -31,8 +31,8 @@ def trained(
 
 @pytest.mark.parametrize("after", [(Adam, {}), (Adam, {"fused": True}), (ReplayedAdam, {})], ids=str)
 @pytest.mark.parametrize("before", [(Adam, {}), (Adam, {"fused": True}), (ReplayedAdam, {})], ids=str)
-def test_a_saved_state_goes_on_under_another_kind_of_step(before, after):
-    """Saved contiguous, as checkpoints are; its learning rate is the saved one's, its kind the own."""
+def test_adam_state_transfers_between_implementations(before, after):
+    """The state is saved contiguously; the learning rate's value is restored, but not its type."""
     whole, _ = trained(Adam, 5)
     weights, adam = trained(before[0], 3, **before[1])
     set_learning_rate(adam, 0.2)
@@ -44,7 +44,7 @@ def test_a_saved_state_goes_on_under_another_kind_of_step(before, after):
     torch.testing.assert_close(weights, whole)
 
 
-def test_a_state_of_a_gpu_is_taken_on_a_cpu():
+def test_adam_state_of_a_gpu_loads_on_a_cpu():
     weights, adam = trained(Adam, 3)
     state = adam.state_dict()
     state["param_groups"][0] |= {"capturable": True, "fused": True, "lr": torch.tensor(0.1)}

@@ -31,12 +31,12 @@ def window() -> Windows:
         ({"readout": "state+frame"}, r"unknown readout 'state\+frame': choose one of state, frame, frame\+state"),
     ],
 )
-def test_what_would_be_another_encoder_is_refused(changes, message):
+def test_unknown_history_and_readout_are_rejected(changes, message):
     with pytest.raises(UserError, match=message):
         Encoder(EncoderConfig(6, **changes))
 
 
-def test_observations_of_another_shape_are_refused():
+def test_observations_of_another_shape_are_rejected():
     encoder, other = make("gru", True), window()
     for obs in (other.obs[..., :64, :64], other.obs[:, :, :3]):
         with pytest.raises(UserError, match=r"reads observations of shape \(9, 84, 84\), not \("):
@@ -48,7 +48,7 @@ def test_observations_of_another_shape_are_refused():
 @pytest.mark.parametrize("span", [None, 1, 2, 5, 99])
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("number", [1, 3])
-def test_a_state_reads_its_own_version_of_each_row(number: int, layers: int, span: int | None):
+def test_gru_reads_the_matching_version_of_each_row(number: int, layers: int, span: int | None):
     torch.manual_seed(0)
     gru = GRU(3, GRUOptions(hidden_dim=4, gru_layers=layers))
     versions, length = torch.randn(number, 2, 6, 3), torch.tensor([6, 4])
@@ -60,19 +60,19 @@ def test_a_state_reads_its_own_version_of_each_row(number: int, layers: int, spa
             torch.testing.assert_close(out[b, j], run_memory(gru, rows.flip(0)[None])[0][0, -1])
 
 
-def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
+def test_encoder_folder_round_trip(tmp_path):
     encoder, batch = make("gru", True), window()
     save_encoder(str(tmp_path), encoder, CARD)
     drawn = torch.get_rng_state()
     loaded, card = load_encoder(str(tmp_path), "walker_walk", 2)
-    assert torch.equal(torch.get_rng_state(), drawn), "loading draws nothing from the caller's generator"
+    assert torch.equal(torch.get_rng_state(), drawn), "loading must not draw from the global generator"
     assert card == CARD
     with torch.no_grad():
         torch.testing.assert_close(loaded.encode(batch), encoder.encode(batch))
     assert not any(p.requires_grad for p in loaded.parameters())
 
 
-def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
+def test_encoder_with_unregistered_corruption_is_rejected(tmp_path):
     save_encoder(tmp_path, Encoder(EncoderConfig(action_dim=6)), replace(CARD, corruption={"corruption": "fog"}))
     with pytest.raises(
         UserError, match=r"unknown corruption 'fog'.*, or run or import the file that registers it\); correct"
@@ -80,22 +80,22 @@ def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
         load_encoder(tmp_path)
 
 
-def test_an_option_that_its_part_has_lost_is_no_default(tmp_path):
+def test_removed_options_are_rejected(tmp_path):
     encoder = Encoder(EncoderConfig(action_dim=6))
     save_encoder(tmp_path, encoder, replace(CARD, corruption={"corruption": "patch", "patch_height": 8}))
     with pytest.raises(UserError, match="--patch-height is not read by the corruption patch"):
         load_encoder(tmp_path)
-    for changes, told in (
+    for changes, message in (
         ({"frame_options": {"depth": 3}}, "frame encoder 'drq' has no option 'depth'"),
         ({"history": "gru", "memory_options": {"depth": 3}}, "memory 'gru' has no option 'depth'"),
     ):
         encoder.config = EncoderConfig(action_dim=6, **changes)
         save_encoder(tmp_path, encoder, CARD)
-        with pytest.raises(UserError, match=told):
+        with pytest.raises(UserError, match=message):
             load_encoder(tmp_path)
 
 
-def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
+def test_invalid_encoder_folders_are_rejected(tmp_path):
     with pytest.raises(UserError, match="not an encoder folder"):
         load_encoder(tmp_path)
     save_encoder(tmp_path, make("none", False), CARD)
@@ -123,7 +123,7 @@ def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
     ("part", "field", "value"),
     [("encoder", "hidden_dim", "64"), ("encoder", "size", 2), ("pretrain", "corruption", {"fog": 1})],
 )
-def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
+def test_invalid_encoder_cards_are_rejected(tmp_path, part, field, value):
     save_encoder(tmp_path, make("gru", False), CARD)
     config = json.loads((tmp_path / "config.json").read_text())
     config[part][field] = value
@@ -136,7 +136,7 @@ def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
         load_encoder(tmp_path)
 
 
-def test_a_span_beyond_the_window_costs_no_more_than_the_window():
+def test_span_beyond_the_window_is_clipped():
     gru, x, length = GRU(3, GRUOptions(hidden_dim=4)), torch.rand(2, 7, 3), torch.tensor([7, 5])
     whole, read = run_over_next(gru, x, length, 7), []
     gru.register_forward_hook(lambda module, given, out: read.append(given[0].shape[1]))

@@ -5,7 +5,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.frame import StateFrame, make_frame_encoder
 
 
-def test_a_state_of_another_width_is_refused_in_a_line():
+def test_state_of_another_width_is_rejected():
     frame = StateFrame(17)
     assert frame(torch.zeros(2, 17, 1, 1)).shape == (2, 17)
     with pytest.raises(UserError, match="reads states of 17 coordinates, the task's have 18: pretrain the reference"):
@@ -13,7 +13,7 @@ def test_a_state_of_another_width_is_refused_in_a_line():
 
 
 @pytest.mark.parametrize("size", [84, 83])
-def test_half_the_resolution_is_means_over_two_by_two_pixels_and_none_is_lost(size: int):
+def test_nature_half_averages_two_by_two_pixels(size: int):
     encoder = make_frame_encoder("nature_half", 1, size, {"feature_dim": 8}).double()
     picture = torch.randint(0, 128, (1, 1, size, size)).double() * 2
     moved = picture.clone()

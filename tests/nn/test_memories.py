@@ -1,4 +1,4 @@
-"""The transformer and the linear recurrence against plain loops over rows, written from their papers' equations."""
+"""The transformer and the linear recurrence against loops over rows that follow their papers' equations."""
 
 import math
 
@@ -15,7 +15,7 @@ ROWS, WINDOW = 11, 4
 
 
 def made(name, **options):
-    """A small memory in float64, with every weight away from where it begins, and rows for it."""
+    """A small memory in float64 with perturbed weights, and input rows."""
     torch.manual_seed(0)
     memory = make_memory(name, 5, {"hidden_dim": 16} | options).double().requires_grad_(False)
     for value in memory.parameters():
@@ -28,7 +28,7 @@ def norm(x, layer):
 
 
 def attend(layer, bias, x):
-    """(T, D) -> (T, D): every row and head by itself."""
+    """(T, D) -> (T, D) attention, one row and head at a time."""
     width, out = layer.width // layer.heads, []
     q, k, v = layer.qkv(norm(x, layer.norm)).split(layer.width, dim=1)
     for i in range(len(x)):
@@ -44,7 +44,7 @@ def attend(layer, bias, x):
     return layer.out(torch.stack(out))
 
 
-def test_a_transformer_is_what_its_equations_say():
+def test_transformer_matches_its_equations():
     memory, rows = made("transformer", attention_window=WINDOW)
     for window, found in zip(rows, run_memory(memory, rows)[0], strict=True):
         x = memory.read(window)
@@ -54,7 +54,7 @@ def test_a_transformer_is_what_its_equations_say():
         torch.testing.assert_close(found, norm(x, memory.norm))
 
 
-def test_linear_recurrent_units_are_what_their_equations_say():
+def test_linear_recurrent_units_match_their_equations():
     memory, rows = made("lru")
     for window, found in zip(rows, run_memory(memory, rows)[0], strict=True):
         x = memory.read(window)
@@ -73,7 +73,7 @@ def test_linear_recurrent_units_are_what_their_equations_say():
 
 @pytest.mark.parametrize(("name", "options"), [("transformer", {"attention_window": WINDOW}), ("lru", {})])
 @pytest.mark.parametrize("cuts", [[5, 6], [1] * ROWS, [1, 8, 2], [9, 1, 1]], ids=str)
-def test_parts_of_a_window_of_any_lengths_give_what_the_whole_does(name, options, cuts):
+def test_memory_over_parts_equals_whole_window(name, options, cuts):
     memory, rows = made(name, **options)
     whole, after = run_memory(memory, rows)
     state, read = memory.initial_state(3), []
@@ -85,16 +85,16 @@ def test_parts_of_a_window_of_any_lengths_give_what_the_whole_does(name, options
 
 
 @pytest.mark.parametrize("layers", [1, 3])
-def test_a_transformers_state_sees_its_window_once_for_every_layer_and_no_further(layers):
+def test_transformer_reach_grows_with_layers(layers):
     memory, rows = made("transformer", attention_window=3, transformer_layers=layers)
     assert memory.reach == 2 * layers + 1
     out, _ = run_memory(memory, rows)
     late, _ = run_memory(memory, rows[:, 2:])
     same = (out[:, 2:] - late).abs().amax((0, 2)) < 1e-12
-    assert same.tolist() == [t >= 2 * layers for t in range(ROWS - 2)], "places in a window make no difference"
+    assert same.tolist() == [t >= 2 * layers for t in range(ROWS - 2)], "positions in the window do not matter"
 
 
-def test_a_scan_is_the_recurrence_with_its_gradients_and_stays_finite_over_long_episodes():
+def test_scan_matches_the_recurrence_and_its_gradients():
     g = torch.Generator().manual_seed(0)
     for rows in (1, 2, 7, 8):
         decay, inputs, before = (
@@ -114,41 +114,41 @@ def test_a_scan_is_the_recurrence_with_its_gradients_and_stays_finite_over_long_
     )
 
 
-def test_linear_units_begin_on_their_ring_with_states_of_one_size():
+def test_linear_units_are_initialised_on_their_ring():
     torch.manual_seed(0)
     memory = make_memory("lru", 5, {"r_min": 0.9, "r_max": 0.99, "max_phase": 0.5, "lru_units": 2000})
     decay, phase = (-memory.nu.detach().exp()).exp(), memory.theta.detach().exp()
     assert 0.9 <= decay.min() < 0.901 < 0.989 < decay.max() <= 0.99
     assert 0 < phase.min() < 0.01 < 0.49 < phase.max() <= 0.5
     torch.testing.assert_close((decay**2).mean(), torch.tensor((0.9**2 + 0.99**2) / 2), atol=2e-3, rtol=0)
-    # white noise of size one comes to rest at gamma^2 / (1 - |lambda|^2)
+    # unit white noise has the stationary variance gamma^2 / (1 - |lambda|^2)
     variance = (2 * memory.gamma.detach()).exp() / (1 - decay**2)
     torch.testing.assert_close(variance, torch.ones_like(variance), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("inputs", [256, 262, 263])
-def test_memories_of_one_width_have_as_many_parameters(inputs):
-    """Of the default width: e(o_t), with six numbers of action, and with MIK's flag."""
+def test_memories_of_equal_width_have_similar_size(inputs):
+    """Default width; inputs e(o_t), with six action dimensions, and with MIK's flag."""
     counts = {name: sum(p.numel() for p in make_memory(name, inputs, {}).parameters()) for name in MEMORIES}
     assert counts == {name: pytest.approx(counts["gru"], rel=0.01) for name in MEMORIES}
 
 
 @pytest.mark.parametrize("name", ["gru", "transformer", "lru"])
-def test_a_memory_decides_nothing_by_a_value(name):
-    """So a step can be captured: tensors without values are enough to run it."""
+def test_memories_have_no_data_dependent_control_flow(name):
+    """Meta tensors have no values; captured steps rely on this."""
     memory = make_memory(name, 5, {"hidden_dim": 16}).to("meta")
     out, after = memory(torch.empty(2, 40, 5, device="meta"), memory.initial_state(2))
     assert (out.shape, after.shape) == ((2, 40, 16), memory.initial_state(2).shape)
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"history": "lru", "r_min": 0.9, "r_max": 0.5}, "--r-min is 0.9, --r-max 0.5: choose a greater --r-max"),
         ({"history": "lru", "lru_units": 0}, "lru-units"),
         ({"history": "transformer", "attention_window": 1}, "attention-window"),
     ],
 )
-def test_options_that_cannot_work_are_refused(settings, told):
-    with pytest.raises(UserError, match=told):
+def test_invalid_memory_options_are_rejected(settings, message):
+    with pytest.raises(UserError, match=message):
         PretrainConfig.of("smoke", **settings).check()

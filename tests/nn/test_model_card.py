@@ -1,4 +1,4 @@
-"""An encoder's card: what it says, that a page and YAML take it whatever others called their parts, and its code."""
+"""An encoder's model card: content, escaping and code example."""
 
 import json
 import re
@@ -30,29 +30,29 @@ def folder(tmp_path):
     return tmp_path / "encoder"
 
 
-def test_the_card_says_what_the_config_says_in_the_hubs_format(folder):
+def test_model_card_matches_the_config(folder):
     card = ModelCard.load(folder / "README.md")
     assert (card.data.license, card.data.library_name) == ("mit", "vd4rl-pomdp")
     assert {"mik+a", "walker_walk", "patch", "offline-reinforcement-learning"} <= set(card.data.tags)
-    told = cells(card.text)
-    assert (told["method"], told["data"], told["seed"]) == ("`mik+a`", "fingerprint `f00d`", "0")
-    assert json.loads(told["corruption"].strip("`")) == {"corruption": "patch", "patch_size": 8}
-    assert told["budget"] == "preset `smoke`, 10 gradient steps, 160 frames"
-    assert (told["linear probe"], told["licence"]) == ("not measured", "`mit`")
+    shown = cells(card.text)
+    assert (shown["method"], shown["data"], shown["seed"]) == ("`mik+a`", "fingerprint `f00d`", "0")
+    assert json.loads(shown["corruption"].strip("`")) == {"corruption": "patch", "patch_size": 8}
+    assert shown["budget"] == "preset `smoke`, 10 gradient steps, 160 frames"
+    assert (shown["linear probe"], shown["licence"]) == ("not measured", "`mit`")
     made = read_record(folder)
-    assert told["made by"] == f"vd4rl-pomdp {made.version}" + (f", commit `{made.commit}`" if made.commit else "")
+    assert shown["made by"] == f"vd4rl-pomdp {made.version}" + (f", commit `{made.commit}`" if made.commit else "")
     settings = json.loads(re.search(r"```json\n(.*)\n```", card.text, re.DOTALL)[1])
     assert settings == json.loads((folder / "config.json").read_text())["pretrain"]
 
 
-def test_its_code_loads_the_encoder(folder, monkeypatch, capsys):
+def test_code_of_model_card_loads_the_encoder(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     block = re.search(r"```python\n(.*?)\n```", (folder / "README.md").read_text(), re.DOTALL)[1]
     exec(block, {})
     assert capsys.readouterr().out.split() == ["mik+a", "walker_walk", "12"]
 
 
-def test_an_encoders_name_changes_with_its_weights_and_config_only(folder, tmp_path):
+def test_encoder_hash_depends_on_weights_and_config(folder, tmp_path):
     name = encoder_hash(folder)
     record_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
     assert encoder_hash(folder) == name
@@ -64,11 +64,11 @@ def test_an_encoders_name_changes_with_its_weights_and_config_only(folder, tmp_p
     assert encoder_hash(folder) != name
 
 
-def test_a_probe_is_told_and_copied(folder, tmp_path):
+def test_model_card_shows_the_probe(folder, tmp_path):
     record_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
     copy_encoder(folder, tmp_path / "copy", {"readout": "state"})
-    told = cells((tmp_path / "copy" / "README.md").read_text())["linear probe"]
-    assert told == "error of pose 12.3%, velocity 56.0% of a standard deviation, on held-out episodes"
+    probe = cells((tmp_path / "copy" / "README.md").read_text())["linear probe"]
+    assert probe == "error of pose 12.3%, velocity 56.0% of a standard deviation, on held-out episodes"
     before, copied = read_record(folder), read_record(tmp_path / "copy")
     assert copied == replace(before, encoder=replace(before.encoder, readout="state"))
 
@@ -81,12 +81,12 @@ def test_a_probe_is_told_and_copied(folder, tmp_path):
         (replace(CARD, end_to_end="bc"), 0, "no pretraining: `bc` trains it with the policy"),
     ],
 )
-def test_a_budget_is_what_was_spent(folder, card, frames, budget):
+def test_model_card_shows_the_budget(folder, card, frames, budget):
     text = model_card(replace(read_record(folder), pretrain=card, frames=frames))
     assert cells(text)["budget"] == budget
 
 
-def test_names_of_others_break_neither_the_page_nor_its_front_matter(folder):
+def test_model_card_escapes_names(folder):
     record = read_record(folder)
     name = 'my: "method" | `x`\n---\n'
     text = model_card(replace(record, pretrain=replace(record.pretrain, method=name)), license="apache-2.0")

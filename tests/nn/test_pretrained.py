@@ -1,4 +1,4 @@
-"""A frozen image model as frame encoder: loaded by name or folder, never trained, saved or downloaded."""
+"""A frozen image model as frame encoder: loaded by name or folder; never trained, saved or downloaded."""
 
 import json
 import sys
@@ -34,13 +34,13 @@ def save(transformers, folder: Path, seed: int) -> None:
     transformers.Dinov2Model(config).save_pretrained(folder)
 
 
-def test_it_keeps_the_promises_of_frame_encoders_and_methods_keep_theirs_on_it(model: Path):
-    told = {"model": str(model), "model_size": SIZE}
-    check_frame_encoder("pretrained", size=20, **told)
-    check_method("random", frame_encoder="pretrained", history="gru", **told)
+def test_pretrained_frame_encoder_conforms(model: Path):
+    options = {"model": str(model), "model_size": SIZE}
+    check_frame_encoder("pretrained", size=20, **options)
+    check_method("random", frame_encoder="pretrained", history="gru", **options)
 
 
-def test_each_frame_is_resized_standardised_and_encoded_by_itself(model: Path):
+def test_each_frame_is_resized_standardised_and_encoded(model: Path):
     from transformers import Dinov2Model
 
     frozen, obs = Dinov2Model.from_pretrained(model).eval(), pictures(2, 20)
@@ -56,7 +56,7 @@ def test_each_frame_is_resized_standardised_and_encoded_by_itself(model: Path):
             torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
 
 
-def test_the_command_line_trains_what_stands_behind_it_and_a_folder_says_which_weights(
+def test_pretrained_weights_are_frozen_and_recorded_by_hash(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     import transformers
@@ -66,14 +66,14 @@ def test_the_command_line_trains_what_stands_behind_it_and_a_folder_says_which_w
     words += ["--data", str(data), "--steps", "2", "--checkpoint-every", "1"]
     main(["pretrain", "--method", "mik+a", *words, "--out", str(tmp_path / "run")])
     folder = tmp_path / "run" / "encoder"
-    told = json.loads((folder / "config.json").read_text())["encoder"]["frame_options"]
-    assert (told["model"], told["model_size"], len(told["weights"])) == (str(model), SIZE, 32)
+    options = json.loads((folder / "config.json").read_text())["encoder"]["frame_options"]
+    assert (options["model"], options["model_size"], len(options["weights"])) == (str(model), SIZE, 32)
     encoder, _ = load_encoder(folder)
     before = make("pretrained", model=str(model), model_size=SIZE)
     names = {name for name, _ in encoder.named_parameters()}
     assert {name for name in names if name.startswith("frame.")} == {
         f"frame.project.{layer}.{kind}" for layer in (0, 1) for kind in ("weight", "bias")
-    }, "the model is no part of what is trained or saved"
+    }, "the model is neither trained nor saved"
     obs = pictures(2)
     assert torch.equal(encoder.frame.maps(obs), before.frame.maps(obs))
 
@@ -84,14 +84,14 @@ def test_the_command_line_trains_what_stands_behind_it_and_a_folder_says_which_w
         with pytest.raises(UserError, match=r"--model .*: cannot be loaded from this machine .* run `hf download"):
             load_encoder(folder)
         (other / "model.safetensors").rename(model / "model.safetensors")
-        with pytest.raises(UserError, match=rf"its weights are \w+ by content, not {told['weights']}"):
+        with pytest.raises(UserError, match=rf"its weights are \w+ by content, not {options['weights']}"):
             load_encoder(folder)
         capsys.readouterr()
         with pytest.raises(SystemExit) as end:
             main(["pretrain", "--method", "mik+a", *words, "--out", str(tmp_path / "run")])
         assert end.value.code == 2
         assert "weights" in (error := capsys.readouterr().err)
-        assert error.count("\n") == 1, "a run goes on with the weights that it began with"
+        assert error.count("\n") == 1, "a run resumes only with the weights it started with"
     finally:
         (model / "kept").replace(model / "model.safetensors")
     load_encoder(folder)
@@ -103,21 +103,21 @@ SHAPE = {
 }  # fmt: skip
 
 
-def test_a_size_of_no_whole_patches_is_refused_as_the_border_would_be_unseen(model: Path):
+def test_image_size_must_be_a_multiple_of_the_patch_size(model: Path):
     with pytest.raises(
         UserError, match=r"ignores the last rows and columns of images of 40x40 pixels: choose a --model"
     ):
         make("pretrained", model=str(model), model_size=40)
-    told = make("pretrained", model=str(model), model_size=SIZE).frame.found["weights"]
-    make("pretrained", model=str(model), model_size=40, weights=told)  # of an encoder that exists
+    weights = make("pretrained", model=str(model), model_size=SIZE).frame.found["weights"]
+    make("pretrained", model=str(model), model_size=40, weights=weights)  # existing encoders are accepted
 
 
-def test_features_never_come_from_weights_that_the_file_lacks(tmp_path: Path):
+def test_missing_weights_are_never_initialised_randomly(tmp_path: Path):
     transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
     transformers.ViTForImageClassification(transformers.ViTConfig(**SHAPE)).save_pretrained(tmp_path / "vit")
     transformers.IJepaModel(transformers.IJepaConfig(**SHAPE)).save_pretrained(tmp_path / "ijepa")
     for name, read in (("vit", lambda tokens: tokens[:, 0]), ("ijepa", lambda tokens: tokens.mean(1))):
-        # transformers would make up a pooling layer for the first, anew in every load; the second has no class token
+        # transformers would initialise a pooling layer of the first randomly; the second has no class token
         first, again = (make("pretrained", model=str(tmp_path / name), model_size=SIZE).frame for _ in range(2))
         assert first.found == again.found
         part = first.convolutions
@@ -134,23 +134,23 @@ def test_features_never_come_from_weights_that_the_file_lacks(tmp_path: Path):
         make("pretrained", model=str(tmp_path / "lacking"), model_size=SIZE)
 
 
-def test_a_model_with_text_gives_its_vision_half_under_its_own_statistics(tmp_path: Path):
+def test_clip_uses_its_vision_model_and_statistics(tmp_path: Path):
     transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
     text = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
     config = transformers.CLIPConfig(text_config=text | {"vocab_size": 49408}, vision_config=SHAPE)
     transformers.CLIPModel(config).save_pretrained(tmp_path / "clip")
     plain = make("pretrained", model=str(tmp_path / "clip"), model_size=SIZE).frame
-    told = {"image_mean": [0.1, 0.2, 0.3], "image_std": 0.5}
-    (tmp_path / "clip" / "preprocessor_config.json").write_text(json.dumps(told))
+    statistics = {"image_mean": [0.1, 0.2, 0.3], "image_std": 0.5}
+    (tmp_path / "clip" / "preprocessor_config.json").write_text(json.dumps(statistics))
     frame = make("pretrained", model=str(tmp_path / "clip"), model_size=SIZE).frame
-    assert frame.found != plain.found, "other statistics are another model"
+    assert frame.found != plain.found, "statistics are part of the model's identity"
     image = torch.rand(1, 3, SIZE, SIZE)
     vision = transformers.CLIPVisionModel.from_pretrained(tmp_path / "clip")
-    expected = vision((image - torch.tensor(told["image_mean"])[:, None, None]) / 0.5).pooler_output
+    expected = vision((image - torch.tensor(statistics["image_mean"])[:, None, None]) / 0.5).pooler_output
     torch.testing.assert_close(frame.convolutions(image.repeat(1, 3, 1, 1) - 0.5).view(3, 16), expected.expand(3, 16))
 
 
-def test_random_features_and_other_sizes_are_refused(tmp_path: Path):
+def test_random_features_and_unsupported_sizes_are_rejected(tmp_path: Path):
     transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
     transformers.ViTMAEModel(transformers.ViTMAEConfig(**SHAPE)).save_pretrained(tmp_path / "mae")
     with pytest.raises(UserError, match="its features of one image differ between calls"):
@@ -160,7 +160,7 @@ def test_random_features_and_other_sizes_are_refused(tmp_path: Path):
         make("pretrained", model=str(tmp_path / "vit"), model_size=56)
 
 
-def test_an_absent_library_is_one_line(monkeypatch, tmp_path, capsys):
+def test_missing_transformers_is_reported(monkeypatch, tmp_path, capsys):
     data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
     monkeypatch.setitem(sys.modules, "transformers", None)
     words = ["--method", "random", "--frame-encoder", "pretrained", "--preset", "smoke", "--data", str(data)]
@@ -172,7 +172,7 @@ def test_an_absent_library_is_one_line(monkeypatch, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-def test_absent_weights_and_other_channels_are_one_line(model: Path):
+def test_missing_weights_and_other_channels_are_reported(model: Path):
     with pytest.raises(
         UserError, match=r"--model nobody/nothing: cannot be loaded .*: run `hf download nobody/nothing`"
     ):

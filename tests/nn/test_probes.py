@@ -12,18 +12,16 @@ def random() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_a_linear_function_of_the_state_is_found_and_noise_is_not(random):
+def test_probe_finds_linear_features_and_not_noise(random):
     episode = np.arange(2000) // 100
     states = random.normal(size=(2000, 4)) * [1, 2, 0.5, 3] + 5
     features = states @ random.normal(size=(4, 8)) + 2
     assert probe_error(features, states, episode) < 1
     assert probe_error(random.normal(size=(2000, 8)), states, episode) == pytest.approx(80, abs=3)
-    assert probe_error(np.where(episode[:, None] % 5 == 4, 0, features), states, episode) > 60, (
-        "tested on unseen episodes"
-    )
+    assert probe_error(np.where(episode[:, None] % 5 == 4, 0, features), states, episode) > 60, "tests unseen episodes"
 
 
-def test_r2_is_told_of_every_held_out_episode(random):
+def test_r2_per_held_out_episode(random):
     episode = np.arange(2000) // 100
     states = random.normal(size=(2000, 2))
     assert probe_r2(states, states, episode) == pytest.approx([1] * 4, abs=1e-4)
@@ -34,13 +32,13 @@ def test_r2_is_told_of_every_held_out_episode(random):
     assert apart[1] < 0.3 < 0.9 < min(apart[0], *apart[2:])
 
 
-def test_constant_states_are_left_out_and_one_episode_is_enough_to_test():
+def test_probe_ignores_constant_states():
     states = np.column_stack([np.sin(np.arange(60.0)), np.full(60, 3.0)])
     assert probe_error(states[:, :1], states, np.arange(60) // 20) < 10
     assert probe_error(states[:, :1], states, np.arange(60) // 30) < 10
 
 
-def test_pose_and_velocity_are_apart(random):
+def test_pose_and_velocity_are_probed_separately(random):
     layout = TASKS.named("walker_walk").layout
     physics = random.normal(size=(1000, 18))
     episode = np.arange(1000) // 50
@@ -50,7 +48,7 @@ def test_pose_and_velocity_are_apart(random):
 
 
 @pytest.mark.parametrize("name", ["walker_walk", "cheetah_run", "humanoid_walk"])
-def test_tasks_name_the_columns_of_their_simulators(name: str):
+def test_task_layouts_match_simulator_columns(name: str):
     task = TASKS[name]
     physics = suite.load(task.domain, task.task).physics
     assert task.layout.positions == physics.model.nq
@@ -59,7 +57,7 @@ def test_tasks_name_the_columns_of_their_simulators(name: str):
     assert task.layout.travel == travel
 
 
-def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation(random):
+def test_uninformative_features_score_the_mean_absolute_deviation(random):
     episode, nothing = np.arange(20_000) // 100, np.zeros((20_000, 1))
     for targets, score in (
         (random.normal(size=20_000), 100 * np.sqrt(2 / np.pi)),
@@ -70,6 +68,6 @@ def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation(r
 
 
 @pytest.mark.parametrize("number", [0, 5])
-def test_one_episode_alone_has_none_to_be_tested_on(random, number):
+def test_probe_needs_two_episodes(random, number):
     with pytest.raises(UserError, match="needs at least two episodes"):
         probe_error(random.normal(size=(20, 3)), random.normal(size=(20, 2)), np.full(20, number))

@@ -10,13 +10,13 @@ from vd4rl_pomdp.policies.actor import read_ladder
 LADDERS = sorted(p.stem.removesuffix("_replay") for p in actor.ASSETS.glob("*_replay.safetensors"))
 
 
-def test_the_required_actors_ship_and_all_stay_small():
+def test_shipped_actors_are_complete_and_small():
     assert {"walker_walk", "cheetah_run", "humanoid_walk", "reacher_jump", "point_mass_cue"} <= set(LADDERS)
     assert sum(p.stat().st_size for p in actor.ASSETS.iterdir()) < 10e6
 
 
 @pytest.mark.parametrize("task", LADDERS)
-def test_a_ladder_leads_to_the_medium_actor(task):
+def test_ladder_ends_with_the_medium_actor(task):
     ladder, medium = load_ladder(task), load_actor(task, "medium")
     steps = ladder.card["decisions"]
     assert steps == sorted(set(steps))
@@ -33,13 +33,13 @@ def numbered(value):
     return Actor({"mean.weight": np.full((2, 1), value, np.float32), "mean.bias": np.zeros(1, np.float32)}, {})
 
 
-def test_a_ladder_gives_each_moment_the_nearest_rung_in_proportion():
+def test_ladder_returns_the_nearest_rung():
     ladder = Ladder.of([numbered(1), numbered(2), numbered(3)], {"decisions": [20, 60, 100]})
     acting = [ladder.actor_at((episode + 0.5) / 10) for episode in range(10)]
     assert [a and a.weights["mean.weight"][0, 0] for a in acting] == [None, 1, 1, 1, 2, 2, 2, 2, 3, 3]
 
 
-def test_sampled_actions_scatter_around_the_mean_action():
+def test_sampled_actions_are_centred_on_the_mean_action():
     shipped = load_actor("walker_walk", "expert")
     state, rng = np.zeros(24, np.float32), np.random.default_rng(0)
     sampled = np.stack([shipped.act(state, rng) for _ in range(500)])
@@ -50,7 +50,7 @@ def test_sampled_actions_scatter_around_the_mean_action():
     assert np.allclose(below, 0.5, atol=0.08)
 
 
-def test_bad_actors_are_refused(tmp_path, monkeypatch):
+def test_invalid_actor_files_are_rejected(tmp_path, monkeypatch):
     path = tmp_path / "actor.safetensors"
     path.write_bytes(b"\x80\x04 a pickle")
     with pytest.raises(UserError, match="not an actor file"):
@@ -79,14 +79,14 @@ HEADS = ("mean", "log_std")
 
 
 @pytest.mark.parametrize("how", ["none", "narrow", "wide", "nan"])
-def test_whole_files_whose_weights_are_no_actor_are_refused(tmp_path, how):
+def test_unfit_actor_weights_are_rejected(tmp_path, how):
     shipped, path = load_actor("walker_walk", "medium"), tmp_path / "actor.safetensors"
     Actor(spoil(shipped.weights, how), shipped.card).save(path)
     with pytest.raises(UserError, match="its weights do not fit an actor of walker_walk"):
         read_actor(path, "walker_walk")
 
 
-def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
+def test_ladders_and_actors_are_not_interchangeable():
     with pytest.raises(UserError, match="do not fit an actor"):
         read_actor(actor.ASSETS / "walker_walk_replay.safetensors")
     with pytest.raises(UserError, match="contains no actor snapshots"):
@@ -94,7 +94,7 @@ def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
 
 
 @pytest.mark.parametrize("card", [{}, {"card": "{"}, {"card": "[1]"}, {"card": "3"}, {"card": "{}"}])
-def test_a_file_without_a_whole_card_is_one_sentence(tmp_path, card):
+def test_actor_without_valid_card_is_rejected(tmp_path, card):
     path = tmp_path / "actor.safetensors"
     save_file(load_actor("walker_walk", "medium").weights, path, card)
     with pytest.raises(UserError, match=r"not an actor file|trained on None"):
