@@ -33,7 +33,7 @@ def interrupted(*arguments):
     raise KeyboardInterrupt
 
 
-def test_an_agent_remembers_its_actions_whatever_its_caller_does_to_their_arrays():
+def test_agent_copies_its_last_action():
     agent = load_agent("walker_walk/medium_expert/patch+zero_frames/mik+a")
     pictures = np.random.default_rng(0).integers(0, 256, (3, 9, 84, 84), dtype=np.uint8)
 
@@ -58,9 +58,7 @@ def test_an_agent_remembers_its_actions_whatever_its_caller_does_to_their_arrays
         agent.set_last_action(np.zeros(3))
 
 
-def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop(
-    data, encoder, tmp_path, capsys, monkeypatch
-):
+def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path, capsys, monkeypatch):
     run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=6)).path
     out = tmp_path / "agents" / "mine"
     with monkeypatch.context() as patch:
@@ -125,14 +123,14 @@ def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop
             load_agent(out)
 
 
-def test_a_film_shows_agents_that_see_frames_of_two_sizes():
+def test_film_of_agents_with_different_frame_sizes():
     shapes = [{"clean": (2, 3, size, size), "corrupted": (2, 9, size, size), "return": (2,)} for size in (84, 48)]
     films = [{name: np.zeros(shape, np.uint8) for name, shape in one.items()} for one in shapes]
     with Image.open(io.BytesIO(side_by_side(["large", "small"], films))) as moving:
         assert moving.size == (4 * (2 * 84 + 4), 2 * 84 + 26 + 2 * 48 + 26)
 
 
-def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
+def test_only_finished_finetuning_runs_are_exported(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     (whole_run(tmp_path / "cut") / "timing.json").unlink()
     pretraining(tmp_path / "pretrained")
@@ -148,14 +146,14 @@ def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
     assert not (tmp_path / "new").exists()
 
 
-def test_an_unknown_name_lists_what_ships(tmp_path):
+def test_unknown_agent_lists_shipped_ones(tmp_path):
     with pytest.raises(UserError) as told:
         load_agent("walker_walk/medium_expert/patch/mine")
     assert f"or a shipped agent ({', '.join(shipped()) or 'none'})" in str(told.value)
     assert "\n" not in str(told.value)
 
 
-def test_those_that_ship_play_their_first_episode_to_the_digit():
+def test_shipped_agents_reproduce_their_first_episode():
     for name in shipped():
         card = load_agent(name).card
         assert name.startswith(f"{card['task']}/{card['quality']}/{card['corruption']['corruption']}/{card['method']}")

@@ -104,7 +104,7 @@ def wrong() -> list[tuple[str, str, str]]:
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(data=st.data())
-def test_a_wrong_value_ends_in_one_line_and_exit_code_2_and_nothing_is_written(world, data):
+def test_invalid_flag_values_print_one_line_and_write_nothing(world, data):
     command, flag, value = data.draw(st.sampled_from(wrong()))
     words = [*command.split(), *VALID[command]]
     if flag_of(flag) in words:

@@ -52,7 +52,7 @@ def _replaced(draw, whole: bytes) -> bytes:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(data=st.data())
-def test_a_damaged_file_is_read_or_refused_in_one_line(world, tmp_path_factory, data):
+def test_damaged_files_are_read_or_rejected_in_one_line(world, tmp_path_factory, data):
     words, pattern = data.draw(st.sampled_from(READERS))
     name = data.draw(st.sampled_from(sorted(p.relative_to(world) for p in world.glob(pattern) if p.is_file())))
     damaged = data.draw(st.sampled_from([_truncated, _flipped, _replaced]))(data.draw, (world / name).read_bytes())

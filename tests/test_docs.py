@@ -106,14 +106,14 @@ def _registries():
         yield
 
 
-def test_every_block_is_in_a_language_that_is_looked_at():
+def test_code_blocks_have_a_tested_language():
     fences = [(page.name, tag) for page in PAGES for tag in re.findall(r"^```(\w*)$", page.read_text(), re.MULTILINE)]
     assert {tag for _, tag in fences} <= {"python", "bash", "toml", ""}
     closing = sum(tag == "" for _, tag in fences)
     assert closing == len(fences) - closing, "a block without a language"
 
 
-def test_every_command_is_run_or_has_a_reason_not_to_be():
+def test_documented_commands_are_run_or_excluded():
     unexplained = [line for page, line in COMMANDS if not is_run(page, line) and not line.startswith(tuple(NOT_RUN))]
     assert unexplained == []
     assert [reason for reason in NOT_RUN if not any(line.startswith(reason) for _, line in COMMANDS)] == []
@@ -123,7 +123,7 @@ OURS = [(page, line) for page, line in COMMANDS if line.split()[:1] in PROGRAMS 
 
 
 @pytest.mark.parametrize(("page", "line"), OURS, ids=[f"{page.stem}: {line}" for page, line in OURS])
-def test_every_command_has_flags_and_values_that_exist(page, line, tmp_path, monkeypatch):
+def test_documented_commands_parse(page, line, tmp_path, monkeypatch):
     parsed = []
     real = tyro.cli
 
@@ -188,7 +188,7 @@ def small(words: list[str]) -> list[str]:
     return [{"cpu": "smoke", "paper": "smoke", "20000": "20", "20": "1"}.get(word, word) for word in words]
 
 
-def test_the_readmes_commands_run_one_after_the_other(study, capsys):
+def test_readme_commands_run(study, capsys):
     lines = [line for page, line in COMMANDS if is_run(page, line)]
     assert {" ".join(line.split()[:2]) for line in lines} >= {"vd4rl-pomdp pretrain", "vd4rl-pomdp sweep"}
     for line in lines:
@@ -201,7 +201,7 @@ PYTHON = [page for page in PAGES if blocks(page, "python")]
 
 
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
-def test_python_blocks_run_one_after_the_other(page, encoder):
+def test_python_blocks_run(page, encoder):
     namespace = {"__name__": page.stem}
     if page.stem == "use_an_encoder":
         write_agent(Path("runs/mik+a/pretrain"), Path("agents/mik-walker"))
@@ -212,7 +212,7 @@ def test_python_blocks_run_one_after_the_other(page, encoder):
     check_results(page.stem, namespace)
 
 
-def test_the_notebook_runs_cell_by_cell_and_is_kept_without_outputs(tmp_path, own_cache, monkeypatch):
+def test_notebook_runs_and_has_no_outputs(tmp_path, own_cache, monkeypatch):
     monkeypatch.setattr("tempfile.mkdtemp", lambda: str(tmp_path / "study"))
     cells = json.loads((ROOT / "docs/notebooks/tour.ipynb").read_text())["cells"]
     namespace = {"__name__": "tour"}
@@ -255,7 +255,7 @@ def check_results(page: str, names: dict) -> None:
         assert all((frames[i] != clean[i]).any((0, 2)).sum() == rows for i in shown), "so many rows are black"
 
 
-def test_toml_blocks_are_read_and_name_what_exists():
+def test_toml_blocks_name_entry_point_groups():
     pages = [page for page in PAGES if page.name not in ("README.md", "sweeps.md")]  # whose blocks are grids
     assert FORMATS in REGISTRIES.values()
     found = [tomllib.loads(code)["project"]["entry-points"] for page in pages for code in blocks(page, "toml")]
@@ -264,7 +264,7 @@ def test_toml_blocks_are_read_and_name_what_exists():
     )
 
 
-def test_the_readmes_grid_has_five_seeds_of_four_methods(tmp_path):
+def test_readme_grid_is_valid(tmp_path):
     (block,) = blocks(ROOT / "README.md", "toml")
     (tmp_path / "grid.toml").write_text(block)
     cells = load_grid(str(tmp_path / "grid.toml")).cells()
@@ -272,7 +272,7 @@ def test_the_readmes_grid_has_five_seeds_of_four_methods(tmp_path):
     check_cells(cells, "README's")
 
 
-def test_the_readme_is_short():
+def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().split()) <= 950
 
 
@@ -288,7 +288,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_every_link_within_the_repository_leads_somewhere(page):
+def test_relative_links_exist(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     targets = [target for target in LINK.findall(text) if not target.startswith(("http:", "https:"))]
     broken = []
@@ -302,7 +302,7 @@ def test_every_link_within_the_repository_leads_somewhere(page):
     assert broken == []
 
 
-def test_the_site_is_built_without_a_warning(tmp_path):
+def test_site_builds_without_warnings(tmp_path):
     pytest.importorskip("mkdocs", reason="mkdocs is not installed")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
     built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

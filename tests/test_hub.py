@@ -72,7 +72,7 @@ def lists(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_an_encoder_comes_back_as_it_was_and_what_is_there_is_not_fetched_again(hub, encoder, tmp_path):
+def test_encoder_round_trip_over_the_hub(hub, encoder, tmp_path):
     assert "/models/lab/encoder/commit/" in push(encoder, ENCODER)
     (tmp_path / "new" / "encoder").mkdir(parents=True)
     assert pull(ENCODER, tmp_path / "new" / "encoder")
@@ -85,7 +85,7 @@ def test_an_encoder_comes_back_as_it_was_and_what_is_there_is_not_fetched_again(
     assert lists(tmp_path / "new") == ["encoder"]
 
 
-def test_a_set_comes_back_as_it_was_and_a_later_push_replaces_all_of_an_earlier_one(hub, data, tmp_path):
+def test_dataset_round_trip_over_the_hub(hub, data, tmp_path):
     push(data, SET)
     assert set(hub.files(WHERE[SET])) == {*content(data), "README.md", LISTING, ".gitattributes"}
     hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {"notes.txt": b"the owner's own"})
@@ -100,9 +100,7 @@ def test_a_set_comes_back_as_it_was_and_a_later_push_replaces_all_of_an_earlier_
         pull(SET, tmp_path / "new")
 
 
-def test_cards_on_the_hub_say_how_to_load_what_they_describe_and_under_which_licence(
-    hub, encoder, data, monkeypatch, capsys, tmp_path
-):
+def test_hub_cards_show_license_and_loading_code(hub, encoder, data, monkeypatch, capsys, tmp_path):
     push(encoder, ENCODER, license="apache-2.0")
     push(data, SET)
     cards = {where: hub.files(WHERE[where])["README.md"].decode() for where in (ENCODER, SET)}
@@ -119,7 +117,7 @@ def test_cards_on_the_hub_say_how_to_load_what_they_describe_and_under_which_lic
     assert capsys.readouterr().out.split() == ["mik+a", "walker_walk", "12"]
 
 
-def test_an_agent_comes_back_as_it_was_and_does_not_pass_for_an_encoder(hub, encoder, tmp_path):
+def test_agent_round_trip_over_the_hub(hub, encoder, tmp_path):
     Policy(12, 6, 8).save(encoder.parent / "policy")
     write_rounded(encoder.parent, tmp_path / "agent")
     about = {"task": CARD.task, "method": CARD.method, "corruption": CARD.corruption, "run": "r00"}
@@ -138,7 +136,7 @@ def test_an_agent_comes_back_as_it_was_and_does_not_pass_for_an_encoder(hub, enc
         push(tmp_path / "agent", ENCODER)
 
 
-def test_revisions_are_branches_and_commits(hub, encoder, tmp_path):
+def test_revisions_are_branches_or_commits(hub, encoder, tmp_path):
     push(encoder, ENCODER, private=True)
     assert hub.repos[WHERE[ENCODER]].private
     first = hub.repos[WHERE[ENCODER]].at("main")
@@ -154,7 +152,7 @@ def test_revisions_are_branches_and_commits(hub, encoder, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_only_whole_encoders_and_sets_go_to_repositories_of_their_kind(hub, encoder, data, tmp_path):
+def test_invalid_pushes_are_rejected_before_any_request(hub, encoder, data, tmp_path):
     for text in ("encoder", "datasets/set", "models/lab/encoder", ""):
         with pytest.raises(UserError, match="is not a repository: write OWNER/NAME for an encoder, datasets/OWNER"):
             push(encoder, text)
@@ -171,7 +169,7 @@ def test_only_whole_encoders_and_sets_go_to_repositories_of_their_kind(hub, enco
     assert not hub.requests
 
 
-def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder, tmp_path):
+def test_foreign_repository_is_rejected(hub, encoder, tmp_path):
     repo = hub.repos[WHERE[ENCODER]] = Repo()
     repo.commit("main", {"pytorch_model.bin": b"pickle", "README.md": b""})
     with pytest.raises(UserError, match=r"lab/encoder: holds files that were not pushed by vd4rl-pomdp; choose"):
@@ -193,7 +191,7 @@ def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder
         {"sha256": {"config.json": "", "model.safetensors": "", "../x.md": ""}},
     ],
 )
-def test_a_listing_of_another_kind_or_with_other_files_is_refused(hub, encoder, tmp_path, change):
+def test_invalid_listing_is_rejected(hub, encoder, tmp_path, change):
     push(encoder, ENCODER)
     listing = json.loads(hub.files(WHERE[ENCODER])[LISTING]) | change
     hub.repos[WHERE[ENCODER]].commit("main", hub.files(WHERE[ENCODER]) | {LISTING: json.dumps(listing).encode()})
@@ -202,7 +200,7 @@ def test_a_listing_of_another_kind_or_with_other_files_is_refused(hub, encoder, 
     assert not (tmp_path / "new").exists()
 
 
-def test_damage_is_found_and_only_what_was_damaged_is_fetched_again(hub, encoder, tmp_path):
+def test_damaged_download_is_fetched_again(hub, encoder, tmp_path):
     push(encoder, ENCODER)
     hub.damaged.add("model.safetensors")
     with pytest.raises(UserError, match=r"lab/encoder: model\.safetensors has a wrong SHA-256 and was removed; pull"):
@@ -217,7 +215,7 @@ def test_damage_is_found_and_only_what_was_damaged_is_fetched_again(hub, encoder
     assert lists(tmp_path) == ["new", "run"]
 
 
-def test_a_cut_transfer_is_resumed(hub, encoder, tmp_path, monkeypatch):
+def test_interrupted_transfer_is_resumed(hub, encoder, tmp_path, monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 1000)
     push(encoder, ENCODER)
     hub.cut["model.safetensors"] = 1
@@ -235,7 +233,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("write", FOREIGN.values(), ids=FOREIGN)
-def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, write):
+def test_pull_does_not_overwrite_foreign_files(hub, encoder, tmp_path, write):
     push(encoder, ENCODER)
     write(tmp_path / "there")
     before = content(tmp_path)
@@ -246,7 +244,7 @@ def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, write):
 
 
 @pytest.mark.parametrize(("path", "status"), [("/preupload/", 500), ("/commit/", 403)])
-def test_what_fails_in_a_push_is_one_sentence_and_leaves_no_half(hub, encoder, monkeypatch, path, status):
+def test_failed_push_leaves_the_repository_unchanged(hub, encoder, monkeypatch, path, status):
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
     push(encoder, ENCODER)
     save_encoder(encoder, make("gru", True), replace(CARD, seed=1))
@@ -258,7 +256,7 @@ def test_what_fails_in_a_push_is_one_sentence_and_leaves_no_half(hub, encoder, m
     assert hub.files(WHERE[ENCODER]) == before
 
 
-def test_where_nobody_is_nothing_is_left(encoder, tmp_path, monkeypatch):
+def test_unreachable_hub_leaves_nothing(encoder, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
     monkeypatch.setenv("NO_PROXY", "*")
@@ -268,7 +266,7 @@ def test_where_nobody_is_nothing_is_left(encoder, tmp_path, monkeypatch):
     assert lists(tmp_path) == ["run"]
 
 
-def test_the_commands_of_the_program(hub, encoder, tmp_path, capsys):
+def test_hub_commands(hub, encoder, tmp_path, capsys):
     main(["hub", "push", str(encoder), "lab/encoder", "--private", "--revision", "v1"])
     assert "/models/lab/encoder/commit/" in capsys.readouterr().out
     new = str(tmp_path / "new")

@@ -132,7 +132,7 @@ def at_update(monkeypatch, learner: Any, number: int, then: Callable[[], None]) 
     monkeypatch.setattr(learner, "update", changed)
 
 
-def test_a_signal_keeps_the_running_step_and_the_run_ends_as_if_nothing_had_been(stage, whole, tmp_path, monkeypatch):
+def test_run_resumes_bit_exactly_after_sigterm(stage, whole, tmp_path, monkeypatch):
     run, config, learner = stage
     with monkeypatch.context() as patch:
         at_update(patch, learner, 7, lambda: signal.raise_signal(signal.SIGTERM))
@@ -144,7 +144,7 @@ def test_a_signal_keeps_the_running_step_and_the_run_ends_as_if_nothing_had_been
     assert contents(tmp_path / "cut") == whole
 
 
-def test_a_killed_run_ends_in_the_same_bits(stage, whole, tmp_path):
+def test_run_resumes_bit_exactly_after_sigkill(stage, whole, tmp_path):
     """Between two checkpoints, by a signal that no process can handle."""
     run, config, learner = stage
 
@@ -172,7 +172,7 @@ def rows_of_means(steps: list[dict[str, torch.Tensor]], every: int) -> list[dict
     return rows
 
 
-def test_rows_are_means_over_the_steps_since_the_row_before(stage, tmp_path, monkeypatch):
+def test_metric_rows_are_means_since_the_previous_row(stage, tmp_path, monkeypatch):
     """Also if a signal ends the run between two rows, at a step that has no checkpoint of its own."""
     run, config, learner = stage
     config = replace(config(tmp_path / "run"), log_every=4, checkpoint_every=3)
@@ -202,7 +202,7 @@ def test_rows_are_means_over_the_steps_since_the_row_before(stage, tmp_path, mon
         assert set(row) - set(means) <= errors | {f"{RAW_PREFIX}{error}" for error in errors}
 
 
-def test_one_step_whose_loss_is_no_number_ends_the_run(stage, tmp_path, monkeypatch):
+def test_nan_loss_ends_the_run(stage, tmp_path, monkeypatch):
     """Although its row comes later, and the steps between are finite."""
     run, config, learner = stage
     update, calls = learner.update, []
@@ -236,7 +236,7 @@ def fill_disk(monkeypatch, end: str, number: int) -> None:
 
 
 @pytest.mark.parametrize(("end", "number"), [(".pt.tmp", 2), (".model.safetensors.tmp", 1)])
-def test_a_full_disk_is_one_sentence_and_the_same_command_resumes(stage, whole, tmp_path, monkeypatch, end, number):
+def test_run_resumes_bit_exactly_after_full_disk(stage, whole, tmp_path, monkeypatch, end, number):
     run, config, _ = stage
     with monkeypatch.context() as patch:
         fill_disk(patch, end, number)
@@ -246,7 +246,7 @@ def test_a_full_disk_is_one_sentence_and_the_same_command_resumes(stage, whole, 
     assert contents(tmp_path / "cut") == whole
 
 
-def test_a_disk_that_is_full_from_the_start_leaves_a_folder_that_resumes(data, tmp_path, monkeypatch):
+def test_run_resumes_after_full_disk_at_start(data, tmp_path, monkeypatch):
     config = smoke_pretrain(data, tmp_path / "run", method="no_history")
     write = Path.write_text
 
@@ -262,14 +262,14 @@ def test_a_disk_that_is_full_from_the_start_leaves_a_folder_that_resumes(data, t
     assert run_pretrain(config).finished
 
 
-def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_path):
+def test_stages_reject_a_run_in_use(stage, tmp_path):
     run, config, _ = stage
     with owned(tmp_path / "run"), pytest.raises(UserError, match="run: is in use by process"):
         run(config(tmp_path / "run"))
     assert not list((tmp_path / "run").iterdir())
 
 
-def test_a_set_that_another_process_collects_is_refused(tmp_path):
+def test_collections_reject_a_dataset_in_use(tmp_path):
     configs = [
         (collect, CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),
         (collect_maze, MazeCollectConfig.of("smoke", maze="no_curtain", out=tmp_path / "set", workers=1)),
@@ -280,7 +280,7 @@ def test_a_set_that_another_process_collects_is_refused(tmp_path):
         assert not list((tmp_path / "set").iterdir())
 
 
-def test_changed_data_or_another_encoder_is_refused_and_nothing_is_touched(encoder, finetuned, data, tmp_path):
+def test_resuming_with_changed_inputs_is_rejected(encoder, finetuned, data, tmp_path):
     other = write_fake_set(tmp_path / "other" / "walker_walk" / "expert", [20, 30, 25])
     acro = run_pretrain(smoke_pretrain(data, tmp_path / "acro", method="acro")).path / "encoder"
     inputs = read_json(finetuned / "config.json")["inputs"]
@@ -307,7 +307,7 @@ def test_changed_data_or_another_encoder_is_refused_and_nothing_is_touched(encod
             (finetuning / "timing.json").unlink()
 
 
-def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, finetuned, data, tmp_path):
+def test_run_without_checkpoints_keeps_its_evaluations(encoder, finetuned, data, tmp_path):
     config = smoke_finetune(encoder, data, shutil.copytree(finetuned, tmp_path / "run"), **FINETUNE)
     (config.out / "timing.json").unlink()
     shutil.rmtree(config.out / "checkpoints")
@@ -317,7 +317,7 @@ def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, finetun
     assert (config.out / "episodes.csv").read_bytes() == before
 
 
-def test_features_are_encoded_once_however_often_a_run_is_cut(encoder, finetuned, data, tmp_path, monkeypatch):
+def test_features_are_encoded_once_over_resumptions(encoder, finetuned, data, tmp_path, monkeypatch):
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     encode, encoded = FrozenEncoder.frames, []
     monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
@@ -334,9 +334,7 @@ def test_features_are_encoded_once_however_often_a_run_is_cut(encoder, finetuned
 
 
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])
-def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
-    encoder, finetuned, data, tmp_path, monkeypatch, evaluation, rows_written
-):
+def test_interrupted_evaluation_is_repeated(encoder, finetuned, data, tmp_path, monkeypatch, evaluation, rows_written):
     """Also in the last one, where rows under the run's own corruption alone are not all."""
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     append, evaluations = finetune.trainer.append_episodes, []

@@ -35,7 +35,7 @@ CHOSEN = {"pretrain": PretrainConfig, "finetune": FinetuneConfig, "navigation tr
 """Stages whose help shows the options of what is chosen alone."""
 
 
-def test_what_is_not_kept_has_a_reason():
+def test_removed_entries_have_a_reason():
     assert {row["status"] for row in ROWS} <= {"kept", "renamed", "dropped"}
     assert [row["name"] for row in ROWS if row["status"] != "kept" and not row["reason"]] == []
 
@@ -59,7 +59,7 @@ def _help(words: list[str]) -> list[str]:
     return shown.getvalue().replace("│", " ").replace(",", " ").split()
 
 
-def test_parts_grids_ids_and_import_paths_are_there():
+def test_plugins_grids_ids_and_import_paths_exist():
     names = {f"{kind} {name}" for kind, registry in REGISTRIES.items() for name in registry}
     names |= {f"action_target {name}" for name in ACTION_TARGETS}
     assert [name for name in KEPT["part"] if name not in names] == []

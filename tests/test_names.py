@@ -24,7 +24,7 @@ def test_definitions_are_classes_and_aliases():
     assert definitions(source) == {"Aa", "Bb", "Cc", "Dd"}
 
 
-def test_a_name_means_one_thing():
+def test_public_names_are_unique():
     places = defaultdict(list)
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):

@@ -51,7 +51,7 @@ def load(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_an_example_runs_through_every_stage_and_the_record_names_it(load, tmp_path, monkeypatch, kind):
+def test_documented_plugins_run_in_all_stages_and_are_recorded(load, tmp_path, monkeypatch, kind):
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     load(kind)
     name, option, value = EXAMPLES[kind]
@@ -80,7 +80,7 @@ def test_an_example_runs_through_every_stage_and_the_record_names_it(load, tmp_p
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_help_shows_an_examples_flag_where_its_part_is_chosen_and_list_shows_the_part(load, capsys, monkeypatch, kind):
+def test_help_and_list_show_documented_plugins(load, capsys, monkeypatch, kind):
     name, option, _ = EXAMPLES[kind]
     load(kind)
     monkeypatch.setenv("COLUMNS", "200")
@@ -96,7 +96,7 @@ def test_help_shows_an_examples_flag_where_its_part_is_chosen_and_list_shows_the
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_an_example_keeps_the_promises_of_its_kind(load, kind):
+def test_documented_plugins_conform(load, kind):
     name, option, value = EXAMPLES[kind]
     load(kind)
     check = getattr(testing, f"check_{KINDS[kind]}")
@@ -104,7 +104,7 @@ def test_an_example_keeps_the_promises_of_its_kind(load, kind):
     check(name, **{option: value})
 
 
-def test_a_wrong_claim_of_the_example_is_caught(load):
+def test_wrong_visible_set_of_documented_method_is_caught(load):
     load("method").PastToFrame.visible = lambda self, t, k, rows: ({t, t + k}, set())
     with pytest.raises(
         AssertionError, match=r"method 'past_to_frame' violates its contract(.|\n)*is declared to see rows"
@@ -145,7 +145,7 @@ def registries():
         ("frame_encoder", Options, "name a dataclass that is derived from .*frame.FrameOptions"),
     ],
 )
-def test_what_is_no_class_of_options_is_refused(registries, kind, options, told):
+def test_invalid_options_classes_are_rejected(registries, kind, options, told):
     with pytest.raises(UserError, match=told):
         registries[kind].register("mine", part_with(kind, options))
 
@@ -161,9 +161,7 @@ def test_what_is_no_class_of_options_is_refused(registries, kind, options, told)
         ("algorithm", "readout", "HistoryOptions"),
     ],
 )
-def test_an_option_with_the_name_of_another_setting_is_refused_wherever_both_are_chosen(
-    registries, capsys, kind, option, owner
-):
+def test_conflicting_option_names_are_rejected(registries, capsys, kind, option, owner):
     options = option_called(option, FrameOptions if kind == "frame_encoder" else Options)
     registries[kind].register("mine", part_with(kind, options))
     told = rf"({owner} and Mine|Mine and {owner}) both have the setting '{option}', so --.* would be ambiguous: rename"
@@ -186,7 +184,7 @@ class Dirt(Options):
         frames[..., :9, :] = 0
 
 
-def test_a_corruption_that_fits_the_set_is_not_tried_on_other_frames(registries, tmp_path, monkeypatch):
+def test_corruption_is_checked_on_frames_of_the_dataset(registries, tmp_path, monkeypatch):
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     registries["corruption"].register("dirt", Dirt)
     data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
@@ -194,7 +192,7 @@ def test_a_corruption_that_fits_the_set_is_not_tried_on_other_frames(registries,
     assert pretrain(config).finished
 
 
-def test_two_stages_with_an_option_of_one_name_are_not_chosen_together(registries):
+def test_corruption_stages_with_equal_options_are_rejected(registries):
     registries["corruption"].register("mine", option_called("patch_size"))
     assert CorruptionConfig.of("mine", patch_size=5).stages[0].patch_size == 5
     for name in ("mine+patch", "patch+mine"):

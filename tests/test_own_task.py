@@ -43,7 +43,7 @@ def tasks():
         yield TASKS
 
 
-def test_the_example_runs_through_every_stage(tasks, tmp_path):
+def test_documented_task_runs_in_all_stages(tasks, tmp_path):
     """Worker processes import the file and meet the task in the fine-tuning's episodes; all else is this process's."""
     script, data, runs = tmp_path / "my_task.py", tmp_path / "centre" / "random", tmp_path / "runs"
     script.write_text(CODE)
@@ -70,7 +70,7 @@ def trained(data: Path, out: Path, method: str = "mik+a", **settings: object) ->
     return FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out / "run", workers=1, **settings)
 
 
-def test_a_task_of_dm_control_of_another_size_goes_through_every_stage(tasks, tmp_path):
+def test_dm_control_task_of_another_frame_size_runs_in_all_stages(tasks, tmp_path):
     name, size, data = "cartpole_swingup", 64, tmp_path / "cartpole_swingup" / "random"
     collect(CollectConfig(name, "random", data, episodes=3, workers=1, frame_size=size), 8)
     checked = check_dataset(data)
@@ -86,7 +86,7 @@ def test_a_task_of_dm_control_of_another_size_goes_through_every_stage(tasks, tm
     assert (tmp_path / "report" / "index.html").exists()
 
 
-def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without(tasks, tmp_path):
+def test_state_reference_needs_simulator_states(tasks, tmp_path):
     for name in ("cartpole_swingup", "centre"):
         collect(CollectConfig(name, "random", tmp_path / name, episodes=2, workers=1, frame_size=32), 8)
     config = PretrainConfig.of("smoke", method="state", out=tmp_path / "run", data=tmp_path)
@@ -98,7 +98,7 @@ def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without
         run_pretrain(replace(config, data=tmp_path / "centre", out=tmp_path / "none"))
 
 
-def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into(tasks, tmp_path):
+def test_termination_is_stored_in_the_last_row(tasks, tmp_path):
     tasks.register("fast", replace(tasks["centre"], arguments={"speed": 0.2}))
     (shard,) = collect(CollectConfig("fast", "random", tmp_path / "set", episodes=30, workers=1, frame_size=16), 30)
     rows = read_shard(shard)
@@ -126,7 +126,7 @@ def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into
         ({"frame_size": 15}, "--frame-size is 15; it must be at least 16 and at most 480"),
     ],
 )
-def test_what_a_task_cannot_give_is_refused_before_anything_is_written(tasks, tmp_path, changes, message):
+def test_impossible_collections_write_nothing(tasks, tmp_path, changes, message):
     config = replace(CollectConfig("centre", "random", tmp_path / "set"), **changes)
     with pytest.raises(UserError, match=message):
         collect(config)
@@ -143,12 +143,12 @@ def test_what_a_task_cannot_give_is_refused_before_anything_is_written(tasks, tm
         (DMCTask("cartpole", "swingup", camera="side"), "its camera is 'side': it must be the camera's number"),
     ],
 )
-def test_what_makes_no_task_is_refused_where_it_is_registered(tasks, task, told):
+def test_invalid_tasks_are_rejected_on_registration(tasks, task, told):
     with pytest.raises(UserError, match=f"task 'mine': {told}"):
         TASKS.register("mine", task)
 
 
-def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before_training(tasks, tmp_path):
+def test_too_small_frames_are_rejected_before_training(tasks, tmp_path):
     data = tmp_path / "centre"
     collect(CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=16), 8)
     base = PretrainConfig.of("smoke", data=data, out=tmp_path / "run")
@@ -162,7 +162,7 @@ def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before
         assert not (tmp_path / "run").exists()
 
 
-def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
+def test_evaluation_is_not_longer_than_the_task(tasks, tmp_path):
     tasks.register("short", replace(tasks["centre"], decisions=9))
     data = tmp_path / "short"
     collect(CollectConfig("short", "random", data, episodes=3, workers=1, frame_size=50))
@@ -171,7 +171,7 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
 
 
-def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_benchmarks(tasks, tmp_path):
+def test_evaluation_covers_whole_episodes_of_long_tasks(tasks, tmp_path):
     tasks.register("long", replace(tasks["centre"], arguments={"speed": 0.0}, decisions=510))
     data = tmp_path / "long"
     collect(CollectConfig("long", "random", data, episodes=2, workers=1, frame_size=50), 60)
@@ -183,7 +183,7 @@ def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_be
     assert {row["length"] for row in evaluate_run(run.path, None, 1, 1)[0]} == {510}
 
 
-def test_a_score_is_divided_by_the_tasks_own_number(tasks):
+def test_score_uses_the_tasks_divisor(tasks):
     tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
     (row,) = episode_rows([Episode("none", 0, [2.0], None)], {"task": "games"})
     assert (row["return"], row["score"]) == (2.0, 0.5)
@@ -202,7 +202,7 @@ def test_registered_tasks_have_gymnasium_ids(tmp_path):
     assert done.stdout.splitlines() == ["(9, 32, 32) 200", "500"]
 
 
-def test_a_set_that_is_not_whole_is_not_continued_by_a_task_whose_file_changed(tmp_path):
+def test_changed_task_code_does_not_resume_a_collection(tmp_path):
     file, config = tmp_path / "my_task.py", CollectConfig("centre", "random", tmp_path / "set", episodes=2, workers=1)
     config = replace(config, episodes_per_shard=1, frame_size=50)
 

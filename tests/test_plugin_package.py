@@ -153,7 +153,7 @@ def chosen(*kinds: str) -> list[object]:
     return words
 
 
-def test_the_command_line_finds_an_installed_packages_parts_and_the_record_names_package_and_version(python, tmp_path):
+def test_installed_plugins_are_found_and_recorded_with_version(python, tmp_path):
     data, out = write_fake_set(tmp_path / "dot" / "random", [20, 25, 30], action_dim=2), tmp_path / "runs"
     common = ["--preset", "smoke", "--data", data]
     first, second = chosen("method", "corruption", "frame_encoder"), chosen("algorithm")

@@ -53,7 +53,7 @@ def room(module: str) -> str:
     return package if package != "vd4rl_pomdp" else "roof" if rest.split(".")[0] in ROOF else "ground"
 
 
-def test_the_ground_knows_nothing_of_what_stands_on_it():
+def test_lower_layers_do_not_import_upper_ones():
     wrong = []
     for path in SOURCES:
         name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -65,13 +65,13 @@ def test_the_ground_knows_nothing_of_what_stands_on_it():
     assert wrong == []
 
 
-def test_nothing_but_tests_imports_pytest():
+def test_sources_do_not_import_test_packages():
     trees = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in SOURCES}
     named = {name: {module.split(".")[0] for module in everywhere(tree)} for name, tree in trees.items()}
     assert [name for name in named if named[name] & {"pytest", "_pytest", "hypothesis", "tests"}] == []
 
 
-def test_no_modules_import_each_other_in_a_circle():
+def test_imports_are_acyclic():
     modules = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in SOURCES}
     graph = {}
     for module, path in modules.items():
@@ -81,11 +81,11 @@ def test_no_modules_import_each_other_in_a_circle():
     TopologicalSorter(graph).prepare()  # names the circle, if there is one
 
 
-def test_every_module_says_what_it_is():
+def test_modules_have_docstrings():
     assert [p for p in SOURCES if not ast.get_docstring(ast.parse(p.read_text()))] == []
 
 
-def test_nothing_is_read_by_pickle_or_eval():
+def test_sources_use_no_pickle_or_eval():
     forbidden = re.compile(
         r"\bimport pickle|torch\.load\((?!.*weights_only=True)|allow_pickle=True|(?<!\.)\beval\(|\bexec\("
     )
@@ -110,7 +110,7 @@ def _names_no_encoding(call: ast.Call) -> bool:
     )
 
 
-def test_text_files_are_utf8_whatever_the_machine_speaks():
+def test_text_files_are_opened_as_utf8():
     calls = [
         f"{path.relative_to(ROOT).as_posix()}:{node.lineno}"
         for path in SOURCES
@@ -120,7 +120,7 @@ def test_text_files_are_utf8_whatever_the_machine_speaks():
     assert calls == []
 
 
-def test_constraints_pin_every_dependency_within_its_bounds():
+def test_constraints_pin_dependencies_within_bounds():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     pins = {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
     assert all("+" not in line and "/" not in line and line.count("==") == 1 for line in lines), "builds or hosts"
@@ -131,7 +131,7 @@ def test_constraints_pin_every_dependency_within_its_bounds():
     assert [str(r) for r in wanted if pins.get(canonicalize_name(r.name), "none") not in r.specifier] == []
 
 
-def test_what_dm_control_needs_is_asked_for_where_it_cannot_ask_itself():
+def test_dependencies_of_dm_control_are_required():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     ours = [Requirement(entry) for entry in project["dependencies"]]
     newest = {canonicalize_name(r.name) for r in ours if not r.marker or r.marker.evaluate({"python_version": "3.13"})}
@@ -141,7 +141,7 @@ def test_what_dm_control_needs_is_asked_for_where_it_cannot_ask_itself():
     assert "dm-control" not in newest
 
 
-def test_the_readmes_two_commands_exist_and_ci_runs_the_test_command():
+def test_readme_make_targets_exist():
     readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
     for command in ("demo", "test"):
         assert f"make {command}" in readme
@@ -149,7 +149,7 @@ def test_the_readmes_two_commands_exist_and_ci_runs_the_test_command():
     assert "make test" in (ROOT / ".ci" / "run").read_text()
 
 
-def test_every_registered_name_is_in_the_readme():
+def test_readme_names_all_methods_and_algorithms():
     readme = (ROOT / "README.md").read_text()
     assert [name for name in [*METHODS, *ALGORITHMS] if f"`{name}`" not in readme] == []
 
@@ -169,7 +169,7 @@ def test_every_registered_name_is_in_the_readme():
         ),
     ],
 )
-def test_every_flag_of_a_page_exists(page, configs, least):
+def test_documented_flags_exist(page, configs, least):
     settings = {field.name for name in configs for field in fields(pydoc.locate(name))} | option_names()
     named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / f"{page}.md").read_text())
     assert len(named) > least
@@ -186,12 +186,12 @@ def test_no_machine_paths_in_tracked_files():
     assert found.stdout == ""
 
 
-def test_the_changelog_tells_of_the_present_version():
+def test_changelog_starts_with_current_version():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE).group(1) == version
 
 
-def test_a_wheel_holds_every_file_of_the_packages_and_two_agents(tmp_path):
+def test_wheel_contains_all_package_files_and_two_agents(tmp_path):
     for name in (*PACKAGES, "pyproject.toml", "setup.py", "README.md", "LICENSE"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)

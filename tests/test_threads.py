@@ -31,16 +31,16 @@ def spins(code: str, **environment: str) -> set[str]:
 @pytest.mark.parametrize(
     "module", [*("vd4rl_pomdp", "pretrain", "finetune", "baselines"), *("vd4rl_pomdp.cli", "vd4rl_pomdp.__main__")]
 )
-def test_whatever_is_imported_first_threads_sleep_while_they_wait(module):
+def test_openmp_threads_are_passive_for_any_first_import(module):
     assert spins(f"import {module}; import torch") == {"0"}
 
 
-def test_workers_wait_as_their_caller_does():
+def test_workers_inherit_the_wait_policy():
     assert run(WORKERS).stdout.split() == ["PASSIVE", "PASSIVE"]
 
 
 @pytest.mark.parametrize(
     ("chosen", "count"), [({"OMP_WAIT_POLICY": "ACTIVE"}, "30000000000"), ({"GOMP_SPINCOUNT": "5000"}, "5000")]
 )
-def test_what_the_user_has_set_is_kept(chosen, count):
+def test_user_settings_of_openmp_are_kept(chosen, count):
     assert spins("import vd4rl_pomdp; import torch", **chosen) == {count}

@@ -107,7 +107,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     }
 
 
-def test_whoever_may_open_no_more_files_is_told_that_it_passes(world):
+def test_too_many_open_files_is_reported_as_temporary(world):
     wrong = {}
     for name, read in world.items():
         with suppress(UserError) if name in ("plan of a sweep", "results") else nullcontext():  # mere JSON
@@ -126,7 +126,7 @@ def test_whoever_may_open_no_more_files_is_told_that_it_passes(world):
     assert wrong == {}
 
 
-def test_what_someone_else_may_read_alone_is_neither_called_damaged_nor_to_be_made_again(world, tmp_path, monkeypatch):
+def test_permission_errors_are_not_reported_as_damage(world, tmp_path, monkeypatch):
     def refusing(open_file):
         def refuse(path, *arguments, **options):
             if not isinstance(path, int) and Path(os.fspath(path)).is_relative_to(tmp_path):
@@ -154,7 +154,7 @@ def shard(tmp_path) -> Path:
     return min(write_fake_set(tmp_path / "walker_walk" / "expert").glob("*.hdf5"))
 
 
-def test_a_shard_that_another_program_has_locked_passes_and_names_what_reads_it(shard, own_cache):
+def test_locked_shard_is_reported_as_temporary(shard, own_cache):
     with shard.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with pytest.raises(UnavailableError, match="HDF5_USE_FILE_LOCKING=FALSE"):
@@ -165,7 +165,7 @@ def test_a_shard_that_another_program_has_locked_passes_and_names_what_reads_it(
     assert run_to_end(["data", "check", str(shard.parent)]).code == 0
 
 
-def test_a_shard_that_is_marked_as_being_written_is_not_called_damaged(tmp_path):
+def test_shard_being_written_is_not_reported_as_damaged(tmp_path):
     with h5py.File(tmp_path / "open.hdf5", "w", libver="latest") as file:
         file["action"] = np.zeros(3)
         file.flush()
@@ -176,7 +176,7 @@ def test_a_shard_that_is_marked_as_being_written_is_not_called_damaged(tmp_path)
 
 @pytest.mark.parametrize("place", ["File", "_hl.group.h5o.open"])
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENFILE, errno.EBUSY])
-def test_what_hdf5_says_of_the_system_in_words_passes(shard, monkeypatch, place, number):
+def test_hdf5_system_errors_are_reported_as_temporary(shard, monkeypatch, place, number):
     """h5py raises a KeyError for what fails below an open file, which `get` of its groups takes for no such key."""
     words = f"Unable to synchronously open object (file read failed: time = now\n, errno = {number}, buf = 0x0)"
 
@@ -188,7 +188,7 @@ def test_what_hdf5_says_of_the_system_in_words_passes(shard, monkeypatch, place,
         read_rows(shard)
 
 
-def test_content_and_permissions_are_told_apart_from_what_passes(shard):
+def test_damage_and_permissions_are_not_temporary(shard):
     content = shard.read_bytes()
     shard.write_bytes(content[: len(content) // 2])
     with pytest.raises(UserError, match="truncated, damaged") as damaged:
@@ -201,7 +201,7 @@ def test_content_and_permissions_are_told_apart_from_what_passes(shard):
         assert system_error(shard, error) is None
 
 
-def test_a_cache_whose_disk_has_no_locks_now_passes(shard, tmp_path, monkeypatch):
+def test_cache_without_locks_is_reported_as_temporary(shard, tmp_path, monkeypatch):
     def flock(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -57,7 +57,7 @@ def train(objective: torch.nn.Module, steps: int, noise: float, batch: int = 64,
 
 
 @pytest.mark.parametrize("codes", [0, 8])
-def test_homers_classifier_is_the_bayes_posterior(codes: int):
+def test_homer_classifier_is_the_bayes_posterior(codes: int):
     noise = 0.5
     objective = HOMER(encoder(), None, HOMEROptions(codes), 0)
     train(objective, 700, noise)
@@ -75,7 +75,7 @@ def test_homers_classifier_is_the_bayes_posterior(codes: int):
                 torch.testing.assert_close(found, posterior, atol=0.08, rtol=0)
 
 
-def test_homers_imposters_are_uniform_over_the_batchs_next_states():
+def test_homer_imposters_are_uniform_over_next_states():
     objective, given = HOMER(encoder(), None, HOMEROptions(0), 0), []
     window, _ = finite_windows(4, 3, 0.0, torch.Generator().manual_seed(0))
     window = window.replace(obs=torch.randint(0, 256, window.obs.shape, dtype=torch.uint8))
@@ -91,13 +91,13 @@ def test_homers_imposters_are_uniform_over_the_batchs_next_states():
     assert ((drawn.float().mean(0) - 1 / 8).abs() < 0.11).all()
 
 
-def test_an_anchor_is_found_if_its_own_candidate_is_above_all_negatives():
+def test_share_found_counts_anchors_above_all_negatives():
     scores = torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]])
     assert share_found(scores).item() == pytest.approx(1 / 3)
     assert share_found(scores, torch.tensor([0, 0, 1])).item() == pytest.approx(2 / 3), "row 1 is no negative of row 0"
 
 
-def test_candidates_of_the_anchors_own_group_are_no_negatives():
+def test_info_nce_excludes_candidates_of_the_same_group():
     scores = torch.zeros(6, 6)
     assert info_nce(scores, torch.arange(6)).item() == pytest.approx(math.log(6))
     assert info_nce(scores, torch.tensor([0, 0, 0, 1, 1, 1])).item() == pytest.approx(math.log(4))
@@ -109,7 +109,7 @@ def test_candidates_of_the_anchors_own_group_are_no_negatives():
     )
 
 
-def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action():
+def test_driml_reaches_the_optimal_loss_only_with_actions():
     """With k = 1 and no noise the best scores single out the true next state: the loss is log(its copies)."""
     rows, batch = 2, 64
     g = torch.Generator().manual_seed(9)
@@ -125,7 +125,7 @@ def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action()
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_drimls_anchors_are_a_state_and_the_action_taken_in_it(seed: int):
+def test_driml_anchors_are_state_and_action(seed: int):
     """psi(s_t, a_t) against phi(s_{t+k}): in windows of T rows, a_0..a_{T-1-k} count and the later ones do not."""
     rows, objective = 4, DRIML(encoder(), None, DRIMLOptions(3), seed)
     window, _ = finite_windows(8, rows, 0.0, torch.Generator().manual_seed(0))
@@ -138,7 +138,7 @@ def test_drimls_anchors_are_a_state_and_the_action_taken_in_it(seed: int):
     assert counts == [t + logs["k"].item() < rows for t in range(rows)]
 
 
-def test_driml_draws_every_gap_equally_often():
+def test_driml_draws_gaps_uniformly():
     objective, (window, _) = (
         DRIML(encoder(), None, DRIMLOptions(3), 0),
         finite_windows(2, 4, 0.0, torch.Generator().manual_seed(0)),
@@ -149,7 +149,7 @@ def test_driml_draws_every_gap_equally_often():
 
 
 @pytest.mark.parametrize("term", ["gg", "gl", "lg", "ll"])
-def test_each_term_of_driml_has_projections_of_its_own(term: str):
+def test_driml_terms_have_separate_projections(term: str):
     objective, (window, _) = (
         DRIML(encoder(), None, DRIMLOptions(1), 0),
         finite_windows(4, 3, 0.0, torch.Generator().manual_seed(0)),
@@ -162,7 +162,7 @@ def test_each_term_of_driml_has_projections_of_its_own(term: str):
     assert {name for name in plain if plain[name] != changed[name]} == {f"loss_{term}", "loss"}
 
 
-def test_drimls_scores_are_softly_clipped_and_its_negatives_are_all_others():
+def test_driml_scores_are_clipped_and_negatives_are_all_others():
     """With scores of one size, 20, for every candidate but 18 for the own, the loss tells how many others there are."""
     objective, (window, _) = (
         DRIML(encoder(), None, DRIMLOptions(1), 0),
@@ -183,7 +183,7 @@ def test_drimls_scores_are_softly_clipped_and_its_negatives_are_all_others():
     assert objective.loss(window, 0.0)[0].item() == pytest.approx(expected), "those of the own window count, too"
 
 
-def test_driml_scores_places_against_the_same_place():
+def test_driml_local_features_are_map_positions():
     torch.manual_seed(0)
     objective = DRIML(Encoder(EncoderConfig(1, "nature", 8)), None, DRIMLOptions(1), 0)
     obs = torch.randint(0, 256, (2, 3, 9, 84, 84), dtype=torch.uint8)
@@ -193,7 +193,7 @@ def test_driml_scores_places_against_the_same_place():
     torch.testing.assert_close(places[1, 2, 10], maps[1, 2, :, 1, 3])
 
 
-def test_curls_momentum_encoder_follows_slowly_and_takes_no_gradient():
+def test_curl_momentum_encoder_moves_slowly_without_gradient():
     objective = CURL(encoder(), None, Options(), 0)
     window, _ = finite_windows(8, 3, 0.0, torch.Generator().manual_seed(0))
     objective.loss(window, 0.0)[0].backward()
@@ -208,7 +208,7 @@ def test_curls_momentum_encoder_follows_slowly_and_takes_no_gradient():
         torch.testing.assert_close(after - before, torch.full_like(before, 0.05))
 
 
-def test_curl_compares_two_shifts_the_second_by_the_momentum_encoder():
+def test_curl_encodes_two_random_shifts():
     torch.manual_seed(0)
     objective = CURL(Encoder(EncoderConfig(1, "nature", 8)), None, Options(), 0)
     window, _ = finite_windows(4, 2, 0.0, torch.Generator().manual_seed(0))
@@ -227,7 +227,7 @@ def test_curl_compares_two_shifts_the_second_by_the_momentum_encoder():
         assert (one.flatten(2).float().mean(2) - other.flatten(2).float().mean(2)).abs().max() < 2, "one observation"
 
 
-def test_curl_tells_states_apart_up_to_their_copies():
+def test_curl_reaches_the_optimal_loss():
     """Four distinct observations: the best loss is log(copies of the own one among the candidates)."""
     rows, batch = 1, 64
     g = torch.Generator().manual_seed(9)
@@ -243,7 +243,7 @@ def with_forward_model(kind: type, weight: float) -> torch.nn.Module:
 
 
 @pytest.mark.parametrize("kind", [ACDF, SMWM])
-def test_latent_forward_models_foresee_a_ring_and_the_inverse_model_keeps_its_states_apart(kind: type):
+def test_latent_forward_models_learn_a_ring_without_collapse(kind: type):
     """Without noise each action is told by two states, and each state by the one before and the action."""
     objective = with_forward_model(kind, 1.0)
     assert train(objective, 400, 0.0) < 0.02
@@ -254,7 +254,7 @@ def test_latent_forward_models_foresee_a_ring_and_the_inverse_model_keeps_its_st
 
 
 @pytest.mark.parametrize("kind", [ACDF, SMWM])
-def test_the_forward_loss_is_the_mean_error_of_all_next_states_that_are_real(kind: type):
+def test_forward_loss_is_the_mean_error_over_real_rows(kind: type):
     objective, (window, _) = with_forward_model(kind, 0.5), finite_windows(3, 4, 0.0, torch.Generator().manual_seed(0))
     window = window.replace(length=torch.tensor([4, 2, 3]))
     loss, logs = objective.loss(window, 0.0)
@@ -268,7 +268,7 @@ def test_the_forward_loss_is_the_mean_error_of_all_next_states_that_are_real(kin
     torch.testing.assert_close(loss.detach(), logs["action_loss"] + 0.5 * logs["forward_loss"])
 
 
-def test_acdfs_forward_loss_moves_no_target_and_its_source_in_every_fifth_update_smwms_both_always():
+def test_gradients_of_forward_losses_of_acdf_and_smwm():
     window, _ = finite_windows(2, 4, 0.0, torch.Generator().manual_seed(0))
     for kind, expected in (
         (ACDF, [[True, True, True, False], *[[False] * 4] * 4, [True, True, True, False]]),

@@ -9,7 +9,7 @@ from vd4rl_pomdp.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
 
-def test_every_section_measures_what_its_goals_are_about(tmp_path, monkeypatch):
+def test_sections_contain_all_goals(tmp_path, monkeypatch):
     dataset, opening = suite.synthetic_set(tmp_path, 8)
     assert opening["rows"] == dataset.num_rows == 8 * suite.EPISODE_ROWS
     sections = {"opening": opening, "sampling": suite.sampling(dataset, 5)}
@@ -25,7 +25,7 @@ def test_every_section_measures_what_its_goals_are_about(tmp_path, monkeypatch):
     assert sections["methods"].keys() - {"k_30_over_k_15", "half_over_whole_resolution"} == trained - told_states
 
 
-def test_drawing_is_measured_over_more_frames_than_an_episode_has(monkeypatch):
+def test_rendering_benchmark_spans_episodes(monkeypatch):
     made = suite.make_env
 
     def short(task, render):
@@ -37,7 +37,7 @@ def test_drawing_is_measured_over_more_frames_than_an_episode_has(monkeypatch):
     assert suite._render_wall(5) > 0
 
 
-def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
+def test_sharing_benchmark_compares_two_runs_with_one(monkeypatch):
     speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "ACTIVE"): [125.0]}
 
     def apart(function, seconds, count=1, OMP_WAIT_POLICY=""):
@@ -47,7 +47,7 @@ def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
     assert processes.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "passive_over_active": 0.8}
 
 
-def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
+def test_training_benchmarks_use_the_selected_device(monkeypatch):
     small = partial(suite.synthetic_set, episodes=1)
     named = ("sampling", "pretraining", "finetuning", "methods", "memories")
     for name in ("against_jax", "stacking", "memory", "collection", "sharing", "maze_pictures", "maze_training"):
@@ -60,7 +60,7 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 4]
 
 
-def test_policies_are_measured_against_jax(tmp_path, monkeypatch):
+def test_benchmark_against_jax(tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "BATCH", 4)
     dataset, _ = suite.synthetic_set(tmp_path, 1)
     monkeypatch.setattr(suite, "apart", lambda *_: [{"ms": 1.0, "device": "cpu"}])
@@ -73,14 +73,14 @@ def test_policies_are_measured_against_jax(tmp_path, monkeypatch):
 
 
 @pytest.mark.gpu
-def test_a_set_on_a_gpu_can_be_measured(tmp_path, monkeypatch):
+def test_benchmark_of_a_dataset_on_a_gpu(tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "BATCH", 4)
     dataset = suite.synthetic_set(tmp_path, 8)[0].to("cuda")
     assert suite.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
     assert all(value > 0 for value in suite.finetuning(dataset, 1).values())
 
 
-def test_memory_is_that_of_the_process_over_its_frames(tmp_path, monkeypatch):
+def test_memory_benchmark_divides_by_frames(tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "run_jobs", lambda *_: [[300, 100]])
     told = {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5, "second_process_over_frames": 0.5}
     assert processes.memory(tmp_path, 200) == told
@@ -88,7 +88,7 @@ def test_memory_is_that_of_the_process_over_its_frames(tmp_path, monkeypatch):
     assert processes.memory(tmp_path, 200) == {}
 
 
-def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch):
+def test_maze_training_overhead(monkeypatch):
     def in_turns(rounds, *functions):
         for function in functions:
             function()

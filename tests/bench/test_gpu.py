@@ -22,7 +22,7 @@ def here(monkeypatch):
     monkeypatch.setattr(gpu, "_BETWEEN_WAITS", 1)
 
 
-def test_all_that_is_measured_on_a_gpu_runs_on_a_cpu_and_claims_nothing(here, capsys):
+def test_gpu_benchmark_runs_on_a_cpu(here, capsys):
     main(["bench", "--gpu", "--quick", "--device", "cpu", "--json"])
     told = flatten(json.loads(capsys.readouterr().out))
     assert [name for name in told if name.endswith("failed")] == []
@@ -33,7 +33,7 @@ def test_all_that_is_measured_on_a_gpu_runs_on_a_cpu_and_claims_nothing(here, ca
     assert "jax" in told["td3_bc.jax"] or "no GPU" in told["td3_bc.jax"]
 
 
-def test_a_measurement_that_fails_costs_none_of_the_others(here, monkeypatch, capsys):
+def test_failed_measurement_does_not_stop_the_others(here, monkeypatch, capsys):
     def fails(*_):
         raise RuntimeError("capture failed: not permitted")
 
@@ -48,18 +48,18 @@ def test_a_measurement_that_fails_costs_none_of_the_others(here, monkeypatch, ca
     assert "RuntimeError" in gpu_lines
 
 
-def test_without_a_gpu_only_a_trial_is_run():
+def test_full_gpu_benchmark_needs_a_gpu():
     with pytest.raises(UserError, match="none is visible: on a CPU, try the code with --quick"):
         gpu.gpu_bench("cpu")
 
 
-def test_a_process_that_ends_without_an_answer_is_told():
+def test_process_without_result_is_reported():
     with pytest.raises(WorkerDiedError, match="without a result"):
         processes.apart("vd4rl_pomdp.bench.processes.nothing")
 
 
 @pytest.mark.gpu
-def test_all_is_measured_on_a_gpu_replayed():
+def test_gpu_benchmark_succeeds_on_a_gpu():
     results = gpu.gpu_bench("cuda", quick=True)
     assert [name for name in flatten(results) if name.endswith("failed")] == []
     assert results["td3_bc"]["peak_gib"] > 0

@@ -10,7 +10,7 @@ from vd4rl_pomdp.nn.policy import Policy
 jax = pytest.importorskip("jax", reason="JAX comes with the extra `policy`")
 
 
-def test_the_peer_in_jax_makes_the_same_updates():
+def test_jax_peer_matches_td3_bc_updates():
     from vd4rl_pomdp.bench import jax_peer
 
     torch.manual_seed(0)

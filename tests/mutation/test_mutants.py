@@ -16,7 +16,7 @@ def script(monkeypatch):
     return importlib.import_module("mutants")
 
 
-def test_every_mutant_applies_exactly_once_and_is_python_and_its_test_exists(script):
+def test_mutants_apply_once_and_name_existing_tests(script):
     mutants = script.load_mutants()
     assert len({mutant["name"] for mutant in mutants}) == len(mutants) > 59
     for mutant in mutants:
@@ -27,9 +27,7 @@ def test_every_mutant_applies_exactly_once_and_is_python_and_its_test_exists(scr
         assert re.search(rf"^def {function}\(", (ROOT / file).read_text(), re.MULTILINE), mutant["name"]
 
 
-def test_a_caught_mutant_a_survivor_and_an_edit_that_no_longer_applies_are_told_apart(
-    script, tmp_path, monkeypatch, capsys
-):
+def test_mutants_script_reports_caught_and_surviving_mutants(script, tmp_path, monkeypatch, capsys):
     (tmp_path / "double.py").write_text("def double(x):\n    return 2 * x\n")
     (tmp_path / "test_it.py").write_text("from double import double\n\n\ndef test_two():\n    assert double(2) == 4\n")
     monkeypatch.setattr(script, "copy_tree", lambda tree: tmp_path.rename(tree))

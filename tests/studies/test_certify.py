@@ -48,9 +48,7 @@ POLICIES = (
 )
 
 
-def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
-    states, carried, tmp_path, monkeypatch, capsys
-):
+def test_certificate_is_computed_stored_and_shown(states, carried, tmp_path, monkeypatch, capsys):
     out = tmp_path / "certified"
     words = ["certify", str(states), "patch", "--out", str(out), "--change", *SMALL.split()]
     main(words)
@@ -102,7 +100,7 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     assert line.replace("memory", "Memory") in unescape((tmp_path / "both" / "index.html").read_text())
 
 
-def test_where_there_is_none_for_the_very_set_and_corruption_it_says_so(tmp_path, monkeypatch, capsys):
+def test_missing_certificate_is_reported(tmp_path, monkeypatch, capsys):
     without_figures(monkeypatch)
     for method in ("acro", "mik+a"):
         describe(write_run(tmp_path / "runs" / method, method, 0, {10: [20.0]}), {}, data="f00")
@@ -122,7 +120,7 @@ def test_where_there_is_none_for_the_very_set_and_corruption_it_says_so(tmp_path
     assert f"memory: {NEEDS} (in 2027)\n" in capsys.readouterr().out
 
 
-def test_a_certificate_follows_from_the_intervals_of_both_differences():
+def test_verdict_follows_from_both_intervals():
     def verdict(over_picture, over_integrator, seeds=3, spread=0.01, unit=1.0, level=0.9):
         g = np.random.default_rng(0)
         levels = {MEMORY: level, FLOORS[0]: level - over_picture, FLOORS[1]: level - over_integrator}
@@ -151,7 +149,7 @@ def test_a_certificate_follows_from_the_intervals_of_both_differences():
         (["--jobs", "-1"], "--jobs is -1"),
     ],
 )
-def test_bad_input_is_one_line_and_trains_nothing(states, carried, tmp_path, capsys, words, line):
+def test_invalid_input_trains_nothing(states, carried, tmp_path, capsys, words, line):
     with pytest.raises(SystemExit) as end:
         main(["certify", str(states), "patch", "--out", str(tmp_path / "out"), *words])
     assert end.value.code == 2

@@ -56,7 +56,7 @@ def carried():
     return [line for line in (CARD / "packages.txt").read_text().splitlines() if line and line[0] != "#"]
 
 
-def test_every_dependency_is_carried_or_known_to_be_needless_there():
+def test_all_dependencies_are_packed_or_excluded():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     needed = {r for r in map(Requirement, project["dependencies"]) if "python_version >=" not in str(r.marker)}
     assert {canonicalize_name(r.name) for r in needed} - NOT_CARRIED <= names(carried())
@@ -64,7 +64,7 @@ def test_every_dependency_is_carried_or_known_to_be_needless_there():
     assert names(carried()) <= names(pinned)
 
 
-def test_what_the_machine_has_in_a_version_that_suits_stays_here(monkeypatch):
+def test_packages_present_in_suitable_versions_are_not_packed(monkeypatch):
     monkeypatch.syspath_prepend(CARD)
     import pack
 
@@ -73,12 +73,12 @@ def test_what_the_machine_has_in_a_version_that_suits_stays_here(monkeypatch):
 
 
 @pytest.mark.parametrize("grid", sorted(CARD.glob("*.toml")), ids=lambda path: path.stem)
-def test_the_grids_can_be_carried_out(grid):
+def test_card_grids_are_valid(grid):
     for testing in (False, True):
         check_cells(load_grid(str(grid), testing=testing).cells(), grid.stem)
 
 
-def test_a_part_ends_at_its_limit_and_what_is_finished_goes_home_and_on(tmp_path):
+def test_card_run_stops_at_its_limit_and_continues(tmp_path):
     program = tmp_path / "card" / "site" / "vd4rl_pomdp"
     program.mkdir(parents=True)
     shutil.copy(CARD / "run.py", program.parents[1])

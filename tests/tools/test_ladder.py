@@ -43,14 +43,14 @@ def ran(scripts, data, encoder, tmp_path):
     return work
 
 
-def test_every_policy_is_kept_under_its_own_update(ran):
+def test_ladder_keeps_policies_by_update(ran):
     kept = ran / "snapshots" / "walker_walk" / "finetune-td3_bc"
     assert sorted(path.name for path in kept.iterdir()) == ["2.safetensors", "4.safetensors"]
     last = ran / "runs" / "walker_walk" / "finetune-td3_bc" / "policy" / "model.safetensors"
     assert (kept / "4.safetensors").read_bytes() == last.read_bytes() != (kept / "2.safetensors").read_bytes()
 
 
-def test_a_curve_has_the_rows_that_training_logged(scripts, tmp_path):
+def test_curve_contains_logged_training_rows(scripts, tmp_path):
     losses = {"critic_loss": 1, "actor_loss": 2, "bc_loss": 3}
     rows = [
         {"step": 500, "q": 1 / 3} | losses,
@@ -62,7 +62,7 @@ def test_a_curve_has_the_rows_that_training_logged(scripts, tmp_path):
     assert [(row["step"], row["q"]) for row in curve] == [(500, "0.33333"), (1000, "2")]
 
 
-def test_cloning_losses_are_to_the_actions_of_the_data_as_an_agent_would_see_them(scripts, ran, encoder, monkeypatch):
+def test_cloning_losses_match_an_agent(scripts, ran, encoder, monkeypatch):
     script, asked = scripts("ladder_policies"), []
 
     def collect(config):
@@ -108,7 +108,7 @@ def _loss(encoder, policy, data) -> float:
     return float(np.mean(squares))
 
 
-def test_a_critic_has_converged_where_its_last_fifth_is_level(scripts):
+def test_critic_drift_is_measured_on_the_last_fifth(scripts):
     script = scripts("ladder_table")
     rising = {step: 100.0 + step for step in range(1, 101)}
     assert script.drift(rising, 100) == pytest.approx(20 / 190.5, rel=1e-4), "slope times length, over the mean"
@@ -119,7 +119,7 @@ def test_a_critic_has_converged_where_its_last_fifth_is_level(scripts):
     assert np.isnan(script.drift({90: 1.0, 100: 1.0}, 100)), "two values lie on any line"
 
 
-def test_a_budget_is_the_first_rung_where_every_critic_has_converged_and_held_out_cloning_is_near_its_lowest(scripts):
+def test_budget_is_the_first_converged_rung_near_the_lowest_loss(scripts):
     script = scripts("ladder_table")
     key = script.Key("walker_walk", "expert", "patch", "acro", 256, "bf16", 3000, 100, 4)
 

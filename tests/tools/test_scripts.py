@@ -11,7 +11,7 @@ from vd4rl_pomdp.core.errors import UserError
 SCRIPTS = Path(__file__).parents[2] / "tools"
 
 
-def test_another_python_makes_the_environment_anew(tmp_path):
+def test_setup_recreates_environment_for_another_python(tmp_path):
     """With interpreters that only say their version, note what they make, and agree to all else."""
     (tmp_path / "tools").mkdir()
     shutil.copy(SCRIPTS / "setup.sh", tmp_path / "tools")
@@ -33,7 +33,7 @@ def test_another_python_makes_the_environment_anew(tmp_path):
     assert made_after(**other) == made_after() == ["11", "12"]
 
 
-def test_pages_show_the_tables_that_their_rows_make(monkeypatch):
+def test_generated_tables_are_current(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
     script = importlib.import_module("page_tables")
     pages = {page: {name: list(lines) for name, lines in tables.items()} for page, tables in script.pages().items()}
@@ -43,7 +43,7 @@ def test_pages_show_the_tables_that_their_rows_make(monkeypatch):
         assert script.with_tables(text, tables, page) == text, f"{page}: run `python tools/page_tables.py`"
 
 
-def test_a_table_takes_the_place_of_the_one_under_its_mark(monkeypatch):
+def test_tables_are_replaced_under_their_marks(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
     script = importlib.import_module("page_tables")
     page = "a\n\n<!-- table: one -->\n| old |\n| older |\n\n| not it |\n<!-- table: other -->\nend"

@@ -50,7 +50,7 @@ def configure(training):
 
 
 @pytest.mark.parametrize("name", ACTORS)
-def test_an_actor_returns_what_its_card_says(exporting, name):
+def test_actors_reproduce_returns_of_their_cards(exporting, name):
     """Half of the episodes to the digit: processors differ in a state's last bit, and some episodes magnify it."""
     task, quality = name.rsplit("_", 1)
     shipped = load_actor(task, quality)
@@ -66,7 +66,7 @@ def test_an_actor_returns_what_its_card_says(exporting, name):
     assert (found == said).sum() >= PLAYED / 2, f"{found} in place of {said}"
 
 
-def test_an_exported_actor_acts_like_the_learners_network(training, configure, tmp_path):
+def test_exported_actor_equals_learner_network(training, configure, tmp_path):
     config = configure(tmp_path, **SETTINGS)
     model = training.build(config, TASKS.named("walker_walk"))
     model.learn(120)
@@ -84,7 +84,7 @@ def leaves(tree):
     return [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(tree)]
 
 
-def test_a_run_is_resumed_from_all_it_had_and_another_starts_from_its_export(training, exporting, configure, tmp_path):
+def test_actor_training_resumes_and_warm_starts(training, exporting, configure, tmp_path):
     config = configure(tmp_path / "run", decisions=80, **SETTINGS)
     files = training.train_actor(config)
     names = {f"walker_walk_{quality}.safetensors" for quality in ("expert", "medium", "replay")}
@@ -117,7 +117,7 @@ def test_a_run_is_resumed_from_all_it_had_and_another_starts_from_its_export(tra
         np.testing.assert_allclose(taken.weights["mean.weight"], original.weights["mean.weight"], atol=1e-3)
 
 
-def test_a_refill_trains_the_critics_and_leaves_the_actor(training, configure, tmp_path):
+def test_refill_trains_only_critics(training, configure, tmp_path):
     config = configure(tmp_path, **SETTINGS)
     model = training.build(config, TASKS.named("walker_walk"))
     before, critics = training.export_actor(model, config, 0), leaves(model.policy.qf_state.params)
@@ -129,7 +129,7 @@ def test_a_refill_trains_the_critics_and_leaves_the_actor(training, configure, t
     assert any(not np.array_equal(x, y) for x, y in zip(critics, leaves(model.policy.qf_state.params), strict=True))
 
 
-def test_a_folder_with_something_else_is_refused_untouched(training, exporting, configure, tmp_path):
+def test_foreign_folder_is_rejected_unchanged(training, exporting, configure, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="holds no training run"):
         training.train_actor(configure(tmp_path))

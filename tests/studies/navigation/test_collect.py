@@ -30,7 +30,7 @@ def maze_set(tmp_path_factory) -> Path:
     return out
 
 
-def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tmp_path):
+def test_stored_actions_reproduce_states_and_frames(maze_set, tmp_path):
     dataset = open_dataset(maze_set, tmp_path)
     assert (dataset.num_rows, dataset.num_episodes, dataset.task) == (120, 4, "three_curtains")
     env = MazeEnv("three_curtains", 5)
@@ -44,7 +44,7 @@ def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tm
                 frame, *_ = env.step(dataset.action[row + 1].numpy())
 
 
-def test_a_check_replays_the_states(maze_set, tmp_path):
+def test_data_check_replays_maze_states(maze_set, tmp_path):
     report = check_dataset(maze_set, tmp_path / "cache")
     names = ("task", "rows", "episodes", "replay_max_error")
     assert [report[name] for name in names] == ["three_curtains", 120, 4, 0]
@@ -55,7 +55,7 @@ def test_a_check_replays_the_states(maze_set, tmp_path):
     assert check_dataset(damaged, tmp_path / "cache")["replay_max_error"] == pytest.approx(0.5)
 
 
-def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, monkeypatch):
+def test_resumed_maze_collection_writes_identical_files(maze_set, tmp_path, monkeypatch):
     whole, written = shards.write_shard, []
 
     def cut(path, rows, attributes):
@@ -73,7 +73,7 @@ def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, mo
     assert hashes(tmp_path / "set") == hashes(maze_set)
 
 
-def test_repeat_and_seed_change_the_set(maze_set, tmp_path):
+def test_action_repeat_and_seed_change_the_dataset(maze_set, tmp_path):
     collect(small(tmp_path / "repeat", trajectories=2, action_repeat=2))
     collect(small(tmp_path / "seed", trajectories=2, seed=1))
     folders = (maze_set, tmp_path / "repeat", tmp_path / "seed")
@@ -83,7 +83,7 @@ def test_repeat_and_seed_change_the_set(maze_set, tmp_path):
 @pytest.mark.parametrize(
     ("maze", "changes"), [("hard_no_curtain", {"noise": 1e4}), ("no_curtain", {"random_share": 1})]
 )
-def test_every_trajectory_has_noise_of_its_own(maze, changes, tmp_path, monkeypatch):
+def test_trajectories_have_independent_noise(maze, changes, tmp_path, monkeypatch):
     """Under noise that drowns the planner, or in its place, actions are the noise's signs."""
     loud = replace(MAZES[maze].style, zero_share=0.0, **changes)
     monkeypatch.setitem(MAZES, maze, replace(MAZES[maze], style=loud))
@@ -92,7 +92,7 @@ def test_every_trajectory_has_noise_of_its_own(maze, changes, tmp_path, monkeypa
         assert 0.2 < (signs[one] == signs[other]).mean() < 0.8
 
 
-def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones():
+def test_exploration_replaces_a_fifth_of_the_actions():
     rng, style, wanted = np.random.default_rng(0), MAZES["no_curtain"].style, np.array([3.0, -0.25])
     actions = np.array([_explore(wanted, style, rng) for _ in range(4000)])
     assert (actions == 0).all(1).mean() == pytest.approx(0.1, abs=0.015)
@@ -102,7 +102,7 @@ def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones()
     assert not (noisy == 0).all(1).any()
 
 
-def test_first_person_data_holds_headings_and_moves(tmp_path):
+def test_first_person_data_contains_headings_and_motion(tmp_path):
     collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
     dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
     assert dataset.physics.shape == (120, 6)

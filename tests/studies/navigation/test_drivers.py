@@ -20,7 +20,7 @@ from vd4rl_pomdp.studies.navigation.drivers import (
 )
 
 
-def test_the_planner_reaches_goals_everywhere():
+def test_planner_reaches_goals_in_all_cells():
     env = MazeEnv("hard_no_curtain", 5, pixels=False)
     planner = Planner(env)
     _, info = env.reset(seed=0)
@@ -34,7 +34,7 @@ def test_the_planner_reaches_goals_everywhere():
     assert len(cells) == 7, "all cells of the U were visited"
 
 
-def test_the_papers_planner_halts_beside_every_centre_on_its_way():
+def test_waypoint_planner_halts_in_every_cell():
     env = MazeEnv("no_curtain", 5, pixels=False)
     planner = WaypointPlanner(env, np.random.default_rng(0))
     env.reset(seed=0, options={"state": np.array([-1.0, 1.0, 0.0, 0.0])})
@@ -53,7 +53,7 @@ def test_the_papers_planner_halts_beside_every_centre_on_its_way():
     assert all(moved < WaypointPlanner.NEAR for moved in slowest.values()), slowest
 
 
-def test_waypoints_lie_between_the_centre_of_a_cell_and_its_point():
+def test_waypoints_lie_between_cell_centre_and_goal_point():
     env = MazeEnv("no_curtain", 5, pixels=False)
     env.reset(seed=0)
     ahead = []
@@ -87,7 +87,7 @@ def top() -> np.ndarray:
     return drive("three_curtains", 6)
 
 
-def test_three_curtains_hide_the_mass_a_fifth_of_the_time_and_the_hard_ones_a_third(top):
+def test_curtains_hide_the_expected_share_of_states(top):
     """Theirs is hidden some 22% of the time: ours, if a seventh of the ball's radius may be left to see."""
     three = MAZES["three_curtains"]
     assert three.hidden(top).mean() == pytest.approx(0.185, abs=0.02)
@@ -97,7 +97,7 @@ def test_three_curtains_hide_the_mass_a_fifth_of_the_time_and_the_hard_ones_a_th
     assert MAZES["hard_three_curtains"].hidden(hard).mean() == pytest.approx(0.36, abs=0.04)
 
 
-def test_knowing_nothing_of_velocity_costs_in_raw_units_what_the_paper_prints(top):
+def test_uninformed_velocity_error_matches_the_paper(top):
     """No History's velocity errors are printed as 91.5 to 91.9; as shares of a standard deviation they cannot be."""
     velocity = top[:, 2:]
     ignorance = np.abs(velocity - velocity.mean(0)).mean(0)
@@ -109,7 +109,7 @@ def test_knowing_nothing_of_velocity_costs_in_raw_units_what_the_paper_prints(to
 
 
 @pytest.mark.parametrize("maze", ["first_person", "hard_first_person"])
-def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not(maze):
+def test_shipped_first_person_policy_reaches_goals(maze):
     actor = shipped_actor(MAZES[maze])
     assert actor.card["algorithm"] == "PPO"
     reached = goals_reached(actor, maze, actor.card["action_repeat"], 3)
@@ -118,7 +118,7 @@ def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not(
     assert goals_reached(idle, maze, actor.card["action_repeat"], 3) < reached / 3
 
 
-def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
+def test_ppo_actor_round_trip(tmp_path):
     trained = train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=2000))
     stored = read_actor(tmp_path / "actor.safetensors")
     seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
@@ -132,13 +132,13 @@ def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
     ("changes", "message"),
     [({"maze": "no_curtain"}, "--maze is no_curtain, where a planner drives"), ({"decisions": 0}, "--decisions is 0")],
 )
-def test_wrong_settings_of_a_policy_are_named(tmp_path, changes, message):
+def test_invalid_policy_settings_are_rejected(tmp_path, changes, message):
     with pytest.raises(UserError, match=message):
         train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", **changes))
 
 
 @pytest.mark.parametrize("kind", ["file", "dangling link"])
-def test_a_policy_replaces_nothing(tmp_path, kind):
+def test_policy_training_does_not_overwrite_files(tmp_path, kind):
     out = tmp_path / "actor.safetensors"
     out.write_text("mine\n") if kind == "file" else out.symlink_to("nothing")
     with pytest.raises(UserError, match=r"actor\.safetensors: exists already"):

@@ -34,7 +34,7 @@ def ringed(frame: np.ndarray, point: tuple[float, float], panel: int) -> bool:
     return bool(((there[..., 0] > 200) & (there[..., 2] < 60)).any())
 
 
-def test_the_film_shows_the_mass_through_curtains_and_the_estimate_as_a_ring(tmp_path):
+def test_film_shows_true_and_estimated_positions(tmp_path):
     write_table(tmp_path / "right.csv", [(TRUE, TRUE), (GUESS, GUESS), (TRUE, TRUE)])
     write_table(tmp_path / "wrong.csv", [(TRUE, GUESS), (GUESS, TRUE)])
     write_film({"right": tmp_path / "right.csv", "wrong": tmp_path / "wrong.csv"}, MAZE, tmp_path / "film.gif")
@@ -49,7 +49,7 @@ def test_the_film_shows_the_mass_through_curtains_and_the_estimate_as_a_ring(tmp
     assert [[ringed(frames[1], point, panel) for point in (TRUE, GUESS)] for panel in (0, 1)] == rings[::-1]
 
 
-def test_a_file_that_is_no_trajectory_is_named(tmp_path):
+def test_invalid_trajectory_is_rejected(tmp_path):
     (tmp_path / "bad.csv").write_text("t,x\n0,one\n")
     with pytest.raises(UserError, match=r"bad\.csv: is not a trajectory of a run"):
         write_film({"a": tmp_path / "bad.csv"}, MAZE, tmp_path / "film.gif")

@@ -20,7 +20,7 @@ def noise() -> ExogenousNoise:
 
 
 @pytest.mark.parametrize("name", ["photographs", "textures"])
-def test_a_pool_that_needs_no_files_is_many_different_images_like_natural_ones(name):
+def test_builtin_image_pools(name):
     pool = load_pool(name, 0)
     assert pool.shape == (POOL, 3, 100, 100)
     assert len({picture.numpy().tobytes() for picture in pool}) == POOL
@@ -31,7 +31,7 @@ def test_a_pool_that_needs_no_files_is_many_different_images_like_natural_ones(n
     assert neighbours < strangers / 3, "pixels of natural images resemble their neighbours"
 
 
-def test_a_row_shows_the_same_image_always_and_rows_differ(noise):
+def test_exogenous_image_is_determined_by_the_row(noise):
     pictures = torch.full((200, 3, 100, 100), 50, dtype=torch.uint8)
     key = torch.arange(200)
     first = noise(pictures, key)
@@ -41,7 +41,7 @@ def test_a_row_shows_the_same_image_always_and_rows_differ(noise):
     assert not torch.equal(first, ExogenousNoise("photographs", 0.5, 1)(pictures, key))
 
 
-def test_noise_is_added_and_clipped(noise):
+def test_exogenous_noise_is_added_and_clipped(noise):
     dark, bright = (torch.full((50, 3, 100, 100), v, dtype=torch.uint8) for v in (0, 240))
     key = torch.arange(50)
     added = noise(dark, key)
@@ -73,7 +73,7 @@ def python_batch(pixels: bytes) -> bytes:
     return b"\x80\x02}q\x01U\x04dataq\x02T" + struct.pack("<i", len(pixels)) + pixels + b"q\x03s."
 
 
-def test_cifar_files_of_both_kinds_give_the_same_images(tmp_path):
+def test_cifar_binary_and_python_files_agree(tmp_path):
     for name in ("binary", "python"):
         (tmp_path / name).mkdir()
     images = cifar_binary(tmp_path / "binary")
@@ -86,7 +86,7 @@ def test_cifar_files_of_both_kinds_give_the_same_images(tmp_path):
     assert np.abs(np.sort(planes, 0) - np.sort(ours, 0)).max() < 2
 
 
-def test_a_pickle_is_never_run(tmp_path):
+def test_pickles_are_not_executed(tmp_path):
     """A batch that would write a file, were it unpickled, yields its pixels and nothing else."""
     pixels = bytes(range(256)) * 12
     call = b"cos\nsystem\nU" + bytes([len(f"touch {tmp_path}/harm")]) + f"touch {tmp_path}/harm".encode() + b"\x85R0"
@@ -95,14 +95,14 @@ def test_a_pickle_is_never_run(tmp_path):
     assert not (tmp_path / "harm").exists()
 
 
-def test_other_images_are_read_too(tmp_path):
+def test_png_and_jpeg_images_are_read(tmp_path):
     Image.fromarray(np.full((40, 60, 3), 99, np.uint8)).save(tmp_path / "a.png")
     Image.fromarray(np.full((30, 30), 10, np.uint8)).save(tmp_path / "b.JPG", "JPEG")
     pool = load_pool(str(tmp_path), 0)
     assert sorted(pool.float().mean((1, 2, 3)).tolist()) == pytest.approx([10, 99], abs=2)
 
 
-def test_of_a_folder_of_many_images_only_those_of_the_pool_are_read(tmp_path, monkeypatch):
+def test_only_images_of_the_pool_are_read(tmp_path, monkeypatch):
     for level in range(10, 130, 10):
         Image.fromarray(np.full((20, 30, 3), level, np.uint8)).save(tmp_path / f"{level:03}.png")
     cifar_binary(tmp_path, count=3)
@@ -126,7 +126,7 @@ def test_of_a_folder_of_many_images_only_those_of_the_pool_are_read(tmp_path, mo
         ("a.png", torn_png(), "cannot be read as an image"),
     ],
 )
-def test_folders_without_usable_images_are_named(tmp_path, name, content, message):
+def test_unusable_image_folders_are_rejected(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=message) as caught:
         load_pool(str(tmp_path), 0)
@@ -143,14 +143,14 @@ def test_textures_have_the_spectrum_of_natural_images():
     assert -3.2 < slope < -1.6, "power falls about as the square of the frequency (Field 1987)"
 
 
-def test_grey_quarters_are_area_averages_of_the_luminance():
+def test_grey50_averages_the_luminance():
     pictures = torch.randint(0, 256, (3, 3, 100, 100), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     luma = (pictures.double() * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1)
     expected = luma.view(3, 50, 2, 50, 2).mean((2, 4))
     assert (to_grey50(pictures)[:, 0].double() - expected).abs().max() <= 0.51
 
 
-def test_colours_survive_at_half_the_size():
+def test_rgb50_averages_colours():
     pictures = torch.zeros(2, 3, 100, 100, dtype=torch.uint8)
     pictures[0, 2, ::2] = 201
     pictures[1, 0, :, :50] = 7
@@ -161,7 +161,7 @@ def test_colours_survive_at_half_the_size():
     assert int((small > 0).sum()) == 2500 + 1250
 
 
-def test_sample_observations_are_of_different_moments_and_mazes():
+def test_sample_observations_are_distinct():
     samples = sample_observations()
     assert list(samples) == [*MAZES, "three_curtains, grey50", "three_curtains, exogenous textures"]
     assert [len(pictures) for pictures in samples.values()] == [SAMPLES] * 11

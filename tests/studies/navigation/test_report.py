@@ -101,7 +101,7 @@ def change(file: Path, **told) -> None:
     file.write_text(json.dumps(stored))
 
 
-def test_every_line_of_the_papers_tables_is_a_condition_with_its_own_number():
+def test_paper_numbers_map_to_conditions():
     for line in paper_rows():
         component = line["component"]
         name = component if component == "action_loss" else f"{component}_error"
@@ -119,7 +119,7 @@ def test_every_line_of_the_papers_tables_is_a_condition_with_its_own_number():
         assert paper_number(condition, measure) is None
 
 
-def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
+def test_report_shows_means_seeds_and_paper_numbers(runs, tmp_path):
     page = write_report([runs], tmp_path / "out").read_text()
     numbers = {
         (row["table"], row["view"][:8], "raw" in row["view"], row["row"], row["maze"]): row
@@ -139,7 +139,7 @@ def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
         assert (tmp_path / "out" / "figures" / name).stat().st_size > 5_000
 
 
-def test_the_report_made_from_its_own_rows_is_the_same_and_runs_are_added_to_it(runs, tmp_path):
+def test_report_is_reproducible_and_extendable(runs, tmp_path):
     first = write_report([runs], tmp_path / "out")
     page, kept = first.read_text(), {name: (first.parent / name).read_bytes() for name in ("runs.jsonl", "rows.csv")}
     assert write_report([tmp_path / "out"], tmp_path / "again").read_text() == page
@@ -154,7 +154,7 @@ def test_the_report_made_from_its_own_rows_is_the_same_and_runs_are_added_to_it(
     assert len(loaded(tmp_path / "out")) == 31
 
 
-def test_what_was_not_trained_alike_is_said(tmp_path):
+def test_report_lists_differing_settings(tmp_path):
     alike = [write_run(tmp_path / "runs", Condition("no_curtain", method), 0, 1.0) for method in ("mik+a", "fj", "ah")]
     longer = write_run(tmp_path / "runs", Condition("no_curtain", "no_history"), 0, 1.0)
     write_run(tmp_path / "runs", Condition("no_curtain", "mik+a", self_prediction=True), 0, 1.0)
@@ -181,7 +181,7 @@ def test_what_was_not_trained_alike_is_said(tmp_path):
         ("config.json", {"inputs": {"exogenous": "f2"}}, "exogenous"),
     ],
 )
-def test_seeds_of_another_budget_set_or_setting_make_no_mean(tmp_path, file, told, name):
+def test_seeds_with_different_settings_are_rejected(tmp_path, file, told, name):
     condition = Condition("no_curtain", "ah", exogenous=True)
     folders = [write_run(tmp_path / "runs", condition, seed, 9.0) for seed in (0, 1)]
     for folder, images in zip(folders, ("/a/cifar", "/b/cifar"), strict=True):  # one content at two places
@@ -193,7 +193,7 @@ def test_seeds_of_another_budget_set_or_setting_make_no_mean(tmp_path, file, tol
         loaded(tmp_path / "runs")
 
 
-def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monkeypatch):
+def test_report_shows_missing_and_unfinished_runs(runs, tmp_path, monkeypatch):
     for method in OBJECTIVES:
         for seed in (0, 1, 2)[: 2 if method == "mik" else 3]:
             write_run(tmp_path / "runs", Condition("three_curtains", method), seed, 10.0 + seed)
@@ -213,7 +213,7 @@ def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monke
     assert "| acro-K8 | **37.5** n=1 |" in page.partition("## State estimation errors of what no other table has")[2]
 
 
-def test_the_bar_plot_marks_the_papers_numbers_and_crosses_what_has_no_run(runs, tmp_path, monkeypatch):
+def test_bar_plot_marks_paper_numbers_and_missing_runs(runs, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: drawn.append((at, style.get("marker"))))
     counts = {}
@@ -232,7 +232,7 @@ def test_the_bar_plot_marks_the_papers_numbers_and_crosses_what_has_no_run(runs,
     assert min(told[0] for told in ends if len(told) == 2) == -21, "an error of more than 100 is in the picture"
 
 
-def test_in_first_person_the_place_must_be_known_by_far_and_in_the_papers_order(tmp_path):
+def test_first_person_claims_are_judged(tmp_path):
     levels = {("random", 0): 40, ("mik+a", 0): 21, ("mik+a", 1): 14, ("no_history", 0): 30, ("ah+a", 0): 25}
     for (method, sp), level in levels.items():
         write_run(tmp_path, Condition("compass_first_person", method, self_prediction=bool(sp)), 0, level)
@@ -252,7 +252,7 @@ def test_in_first_person_the_place_must_be_known_by_far_and_in_the_papers_order(
     assert told[1].raw() == told[1], "15% is no number of raw units"
 
 
-def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs):
+def test_report_shows_verdicts_beside_the_paper(runs):
     page = verdict_lines(loaded(runs))
     rows = {line.split(" | ")[1]: line for line in page if line.startswith("| three_curtains | ")}
     assert rows["no_history's velocity error, of mik+a's >= 3 x"].endswith(
@@ -273,7 +273,7 @@ def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs):
     assert f"Of {sum(answers) - 2} that are judged in both units, none changes." in text
 
 
-def test_what_raw_units_change_is_said_and_without_them_no_number_of_the_paper_is_told(tmp_path):
+def test_report_shows_effect_of_raw_units(tmp_path):
     """In raw units no_history's errors shrink to a tenth: the statement about its velocity holds no more."""
     for method, level in (("mik+a", 21.0), ("no_history", 81.0)):
         results = write_run(tmp_path / "both", Condition("three_curtains", method), 0, level) / "results.json"
@@ -290,7 +290,7 @@ def test_what_raw_units_change_is_said_and_without_them_no_number_of_the_paper_i
     assert not [line for line in page.splitlines() if line.startswith("| MIK+A") and "(6.0)" in line]
 
 
-def test_what_makes_no_one_table_is_named(tmp_path):
+def test_duplicate_runs_and_mixed_presets_are_rejected(tmp_path):
     condition = Condition("three_curtains", "mik")
     write_run(tmp_path / "one", condition, 0, 9.0)
     config = write_run(tmp_path / "other", condition, 0, 9.0) / "config.json"
@@ -302,7 +302,7 @@ def test_what_makes_no_one_table_is_named(tmp_path):
         loaded(tmp_path / "one", tmp_path / "other")
 
 
-def test_sample_observations_are_drawn_where_they_are_asked_for(runs, tmp_path):
+def test_report_includes_sample_observations_on_request(runs, tmp_path):
     rng = np.random.default_rng(0)
     samples = {name: rng.integers(0, 256, (2, 3, 9, 9), np.uint8) for name in ("a maze", "with noise, dark")}
 
@@ -318,7 +318,7 @@ def test_sample_observations_are_drawn_where_they_are_asked_for(runs, tmp_path):
         assert len(np.unique(np.asarray(picture).reshape(-1, 4), axis=0)) > 4 * 81
 
 
-def test_a_method_that_knows_no_k_is_one_of_k_1(tmp_path):
+def test_methods_without_k_count_as_k_1(tmp_path):
     folder = write_run(tmp_path, Condition("no_curtain", "ah"), 0, 5.0)
     record = json.loads((folder / "config.json").read_text())
     del record["config"]["max_k"]
@@ -328,7 +328,7 @@ def test_a_method_that_knows_no_k_is_one_of_k_1(tmp_path):
     assert run.condition == Condition("no_curtain", "one_step_inverse", max_k=1)
 
 
-def test_free_cells_are_the_librarys():
+def test_free_cells_match_gymnasium_robotics():
     from gymnasium_robotics.envs.maze.maps import U_MAZE
 
     library = {(i, j) for i, row in enumerate(U_MAZE) for j, kind in enumerate(row) if kind != 1}

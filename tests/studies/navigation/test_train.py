@@ -57,7 +57,7 @@ def runs(maze_set, tmp_path_factory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("method", METHOD_NAMES)
-def test_every_objective_of_the_paper_trains_and_is_measured(runs, method):
+def test_paper_objectives_train_and_are_evaluated(runs, method):
     found = results(runs[method])
     for component in ("state", "position", "velocity"):
         assert found[f"{component}_error", "held_out", "refit", "all", 0] > 0
@@ -70,7 +70,7 @@ def test_every_objective_of_the_paper_trains_and_is_measured(runs, method):
     assert len(lines) == 41
 
 
-def test_the_run_measures_every_k_hidden_steps_and_both_splits(runs):
+def test_results_cover_all_k_splits_and_hidden_rows(runs):
     found = results(runs["mik+a"])
     assert {k for measure, *_, k in found if measure == "action_loss"} == {0, 1, 2, 3}
     assert {(split, probe) for measure, split, probe, *_ in found if measure == "state_error"} == {
@@ -85,7 +85,7 @@ def test_the_run_measures_every_k_hidden_steps_and_both_splits(runs):
     assert found["state_error", "training", "online", "all", 0] == pytest.approx(expected)
 
 
-def test_averages_are_of_the_last_steps_however_often_metrics_are_logged(maze_set, tmp_path):
+def test_final_averages_do_not_depend_on_log_interval(maze_set, tmp_path):
     few = {"average_last": 5, "evaluation_windows": 2, "refit_windows": 2}
     intervals = (1, 2, 3, 100)
     for every in intervals:
@@ -95,7 +95,7 @@ def test_averages_are_of_the_last_steps_however_often_metrics_are_logged(maze_se
         assert [one[measure] for one in found] == pytest.approx([found[0][measure]] * len(found))
 
 
-def test_the_probe_leaves_the_representation_alone(maze_set, tmp_path):
+def test_probe_does_not_change_encoder_gradients(maze_set, tmp_path):
     trainer, probed = trainer_of(smoke(maze_set, tmp_path / "run"))
     window = trainer.batches.sample()
     past, future = probed.objective.representations(window)
@@ -108,7 +108,7 @@ def test_the_probe_leaves_the_representation_alone(maze_set, tmp_path):
     assert all(parameter.grad is not None for parameter in probed.probe.parameters())
 
 
-def test_a_supervised_reference_learns_from_the_states_alone(maze_set, tmp_path):
+def test_supervised_reference_has_no_action_loss(maze_set, tmp_path):
     trainer, probed = trainer_of(smoke(maze_set, tmp_path / "run", method="supervised+a"))
     loss, logs = probed.loss(trainer.batches.sample(), 0.0)
     loss.backward()
@@ -118,7 +118,7 @@ def test_a_supervised_reference_learns_from_the_states_alone(maze_set, tmp_path)
     assert not trainer_of(smoke(maze_set, tmp_path / "run", method="supervised"))[1].encoder.config.use_actions
 
 
-def test_held_out_trajectories_are_never_trained_on(maze_set, tmp_path):
+def test_held_out_trajectories_are_not_sampled(maze_set, tmp_path):
     data = trainer_of(smoke(maze_set, tmp_path / "run"))[1].data
     assert data.first_held_out == 11
     for held_out in (False, True):
@@ -128,7 +128,7 @@ def test_held_out_trajectories_are_never_trained_on(maze_set, tmp_path):
     assert data.total - data.training == 40 - 16 + 1
 
 
-def test_windows_carry_the_states_of_their_rows(maze_set, tmp_path):
+def test_maze_windows_contain_the_states_of_their_rows(maze_set, tmp_path):
     data = trainer_of(smoke(maze_set, tmp_path / "run"))[1].data
     window = data.windows(torch.tensor([0, 30, 130]))
     raw = data.states[data.dataset.rows(window.key)] * data.std + data.mean
@@ -140,7 +140,7 @@ def test_windows_carry_the_states_of_their_rows(maze_set, tmp_path):
     torch.testing.assert_close(training.std(0), torch.ones(4), atol=1e-4, rtol=0)
 
 
-def test_errors_leave_out_the_burn_in_count_hidden_rows_apart_and_are_in_two_units():
+def test_error_sums_handle_burn_in_hidden_rows_and_units():
     estimate = torch.tensor([9.0, 9, 1, 1, 4])[None, :, None] * torch.tensor([1.0, 1, 2, 2])
     errors, hidden = ErrorSums(), torch.tensor([[True, True, False, False, True]])
     errors.add(estimate, torch.zeros(1, 5, 4), hidden, burn_in=2)
@@ -154,7 +154,7 @@ def test_errors_leave_out_the_burn_in_count_hidden_rows_apart_and_are_in_two_uni
     assert "position_hidden" not in errors.both(torch.ones(4))
 
 
-def test_a_refitted_probe_reads_what_is_there_and_nothing_else():
+def test_refitted_probe_finds_only_encoded_information():
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(4000, 6, generator=generator)
     truth = torch.stack([features[:, 0], features[:, 1] * features[:, 2], features[:, 0].sin(), features[:, 5]], 1)
@@ -166,7 +166,7 @@ def test_a_refitted_probe_reads_what_is_there_and_nothing_else():
     assert isinstance(probe, StateProbe)
 
 
-def test_the_learning_rate_rises_then_falls():
+def test_learning_rate_schedule():
     config = NavigationConfig.of("cpu", steps=1000, warm_up=100)
     rates = [learning_rate(config, step) for step in range(1000)]
     assert rates[0] == pytest.approx(config.learning_rate / 100)
@@ -176,7 +176,7 @@ def test_the_learning_rate_rises_then_falls():
     assert learning_rate(NavigationConfig.of("paper", method="supervised"), 0) == pytest.approx(5e-5)
 
 
-def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
+def test_exogenous_noise_is_added_to_observations(maze_set, tmp_path):
     for picture, shape in (("grey50", (1, 50, 50)), ("rgb50", (3, 50, 50)), ("rgb100", (3, 100, 100))):
         told = {"picture": picture, "frame_encoder": "nature"}
         configs = [smoke(maze_set, tmp_path, exogenous=noise, **told) for noise in ("none", "photographs")]
@@ -201,14 +201,14 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
         ({"exogenous": "photographs", "exogenous_weight": 2.0}, "--exogenous-weight is 2.0"),
     ],
 )
-def test_wrong_settings_are_named(maze_set, tmp_path, changes, message):
+def test_invalid_navigation_settings_are_rejected(maze_set, tmp_path, changes, message):
     with pytest.raises(UserError, match=message) as caught:
         train(smoke(maze_set, tmp_path / "run", **changes))
     assert len(str(caught.value).splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 
-def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
+def test_unsuitable_datasets_are_rejected(tmp_path):
     other = write_fake_set(tmp_path / "walker_walk" / "expert")
     with pytest.raises(UserError, match="names no maze"):
         train(smoke(other, tmp_path / "run"))
@@ -231,7 +231,7 @@ def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
             train(smoke(tmp_path / name, tmp_path / "run"))
 
 
-def test_the_mixer_has_the_papers_shape():
+def test_mixer_and_paper_preset_match_the_paper():
     layers = [m for m in make_frame_encoder("mixer", 3, 100, {}).modules() if isinstance(m, MixerLayer)]
     assert len(layers) == 8
     assert layers[0].over_patches[0].in_features == 100
@@ -244,7 +244,7 @@ def test_the_mixer_has_the_papers_shape():
     assert paper.frame_encoder == "mixer"
 
 
-def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
+def test_recorded_command_reproduces_the_config(maze_set, tmp_path):
     for config in (
         smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),
         NavigationConfig.of("cpu", data=maze_set, out=tmp_path, literal_future=True, seed=4, max_k=1),
@@ -266,7 +266,7 @@ def shift_states(probed: ProbedObjective, held_out: bool) -> None:
     probed.data.states[slice(split, None) if held_out else slice(split)] += 3
 
 
-def test_a_refitted_probe_knows_nothing_of_held_out_states(probed: ProbedObjective):
+def test_refitted_probe_is_not_fitted_on_held_out_states(probed: ProbedObjective):
     probe, before = refitted_errors(probed)
     shift_states(probed, held_out=True)
     again, after = refitted_errors(probed)
@@ -276,7 +276,7 @@ def test_a_refitted_probe_knows_nothing_of_held_out_states(probed: ProbedObjecti
     assert after["held_out"]["state"] > before["held_out"]["state"] + 100
 
 
-def test_the_probe_beside_the_objective_is_measured_on_held_out_states_alone(probed: ProbedObjective):
+def test_online_probe_is_evaluated_on_held_out_states(probed: ProbedObjective):
     losses, before = evaluate(probed)
     shift_states(probed, held_out=False)
     assert evaluate(probed) == (losses, before)

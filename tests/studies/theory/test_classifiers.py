@@ -15,7 +15,7 @@ LIMIT = 2
 
 @MANY
 @given(worlds())
-def test_mik_a_is_the_multi_step_inverse_where_past_and_future_decode(world):
+def test_mik_a_equals_multi_step_inverse_if_states_are_decodable(world):
     m, n = past_memory(world, actions=True), future_memory(world, actions=True)
     assume(m is not None and n is not None and max(m, n) <= LIMIT)
     for k in (1, 2, 3):
@@ -26,7 +26,7 @@ def test_mik_a_is_the_multi_step_inverse_where_past_and_future_decode(world):
 
 @MANY
 @given(worlds())
-def test_ah_is_the_one_step_inverse_where_observations_decode(world):
+def test_ah_equals_one_step_inverse_if_observations_decode(world):
     m = past_memory(world, actions=False)
     assume(m is not None and m <= LIMIT)
     assert all(compare(world, VIEWS["ah"], MemoryLengths(m, 0), k).one_step for k in (1, 2, 3))
@@ -34,13 +34,13 @@ def test_ah_is_the_one_step_inverse_where_observations_decode(world):
 
 @settings(max_examples=25, deadline=None)
 @given(worlds())
-def test_ah_a_is_certain_on_every_world(world):
+def test_ah_a_has_zero_entropy(world):
     assert all(compare(world, VIEWS["ah+a"], MemoryLengths(1, 0), k).certain for k in (1, 2))
 
 
 @settings(max_examples=25, deadline=None)
 @given(worlds())
-def test_seeing_more_never_raises_the_entropy(world):
+def test_more_visible_variables_never_increase_entropy(world):
     memory = MemoryLengths(1, 1)
     for k in (1, 2):
         h = {name: compare(world, VIEWS[name], memory, k).entropy for name in VIEWS if "literal" not in name}
@@ -49,7 +49,7 @@ def test_seeing_more_never_raises_the_entropy(world):
         assert h["mik+a"] <= h["mik"] + 1e-12 <= h["no_history"] + 2e-12
 
 
-def test_the_wrong_classifier_is_told_from_the_right_one():
+def test_mik_a_differs_from_multi_step_inverse_on_the_counterexample():
     """Where the future does not decode, MIK+A's classifier is not the multi-step inverse, and this is noticed."""
     row = compare(counterexample(), VIEWS["mik+a"], MemoryLengths(3, 3), 2)
     assert not row.decodes_end
@@ -61,7 +61,7 @@ def test_the_wrong_classifier_is_told_from_the_right_one():
     assert literal.decodes_end
 
 
-def test_the_jumps_reach_back_behind_m():
+def test_fj_a_sees_actions_up_to_m():
     """FJ+A knows a_t up to k = m+1, and more than the two states at k = m+2: the later window reaches back to t+k-m."""
     rows = [compare(counterexample(), VIEWS["fj+a"], MemoryLengths(3, 3), k) for k in range(1, 7)]
     assert [row.certain for row in rows] == [True] * 4 + [False] * 2
@@ -73,7 +73,7 @@ def test_the_jumps_reach_back_behind_m():
 
 
 @pytest.mark.parametrize("name", [name for name in VIEWS if name != "fj+a literal"])
-def test_views_are_what_the_learned_objectives_declare(name):
+def test_views_match_declared_visible_sets(name):
     method, literal = name.removesuffix(" literal"), name.endswith(" literal")
     m, n, rows = 2, 1, 7
     actions = torch.rand(30, 2)

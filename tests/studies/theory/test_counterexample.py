@@ -28,14 +28,14 @@ def appendix_k4():
 
 
 @pytest.mark.parametrize(("k", "listed"), [(2, K2), (4, set(appendix_k4()))])
-def test_the_appendix_lists(k, listed):
+def test_inverse_examples_match_the_appendix(k, listed):
     assert len(listed) == 2**k
     examples = inverse_examples(counterexample(), k)
     for start in ((0, -1), (0, 1)):
         assert {(actions, end) for s, actions, end in examples if s == start} == listed
 
 
-def test_the_counts_of_the_paper_and_what_it_leaves_out():
+def test_enumeration_matches_the_papers_counts():
     found = enumerated(counterexample())
     assert found["examples"] == 16368
     assert set(range(4, 11)) <= set(found["uniform_k"])
@@ -45,7 +45,7 @@ def test_the_counts_of_the_paper_and_what_it_leaves_out():
     assert found["by_k"][1] == {"k": 2, "examples": 32, "pairs": 32, "certain": 32, "uniform": 0}
 
 
-def test_the_main_texts_actions_give_other_claims():
+def test_main_text_actions_change_the_counts():
     found = enumerated(counterexample((0, 1)))
     assert found["examples"] == 16368
     assert found["uniform_k"] == []
@@ -57,14 +57,14 @@ def make(**arguments):
     return gymnasium.make("vd4rl_pomdp/ForwardJumpCounterexample-v0", disable_env_checker=True, **arguments)
 
 
-def test_the_environment_passes_gymnasiums_checker():
+def test_counterexample_passes_the_gymnasium_checker():
     env = make(render_mode="ansi")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # Gymnasium's kind
         check_env(env.unwrapped)
 
 
-def test_an_action_of_the_world_is_no_place_of_one():
+def test_out_of_range_action_index_is_rejected():
     env = make()
     env.reset(seed=0)
     for wrong in (-1, 2):
@@ -72,7 +72,7 @@ def test_an_action_of_the_world_is_no_place_of_one():
             env.step(wrong)
 
 
-def test_the_environment_walks_as_the_world_does():
+def test_environment_follows_the_world():
     env, world = make(max_episode_steps=9), counterexample()
     rng = np.random.default_rng(0)
     obs, info = env.reset(seed=3)
@@ -90,6 +90,6 @@ def test_the_environment_walks_as_the_world_does():
     assert firsts == set(world.states)
 
 
-def test_bad_environments_are_one_line():
+def test_unknown_world_is_rejected():
     with pytest.raises(UserError, match="choose one of counterexample"):
         make(world="maze")

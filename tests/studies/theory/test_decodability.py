@@ -41,7 +41,7 @@ def literal(length):
 @settings(max_examples=12, deadline=None)
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("actions", [True, False])
-def test_memories_are_those_of_the_joint_law(actions, world):
+def test_memory_lengths_match_enumeration(actions, world):
     """Enumeration of all sequences up to a length finds the same smallest memory, or none up to that length."""
     for memory, enough in (
         (past_memory(world, actions), lambda n: tells(world, past(n, actions), n)),
@@ -52,12 +52,12 @@ def test_memories_are_those_of_the_joint_law(actions, world):
         assert smallest == (memory if memory is not None and memory < LONGEST else None)
 
 
-def test_long_memories_are_found_and_missing_ones_proven():
+def test_long_and_infinite_memories():
     assert past_memory(counterexample(every=12), actions=True) == 11
     assert past_memory(counterexample(every=12), actions=False) is None
 
 
-def test_decodability_of_the_gallery():
+def test_memory_lengths_of_the_gallery():
     assert [past_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [3, 1, 1]
     assert [past_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, 1]
     assert [future_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [None, 1, 1]
@@ -65,7 +65,7 @@ def test_decodability_of_the_gallery():
     assert future_memory(counterexample(), actions=True, literal=True) == 3
 
 
-def test_noise_and_policies_change_neither_dynamics_nor_decodability():
+def test_noise_and_policy_do_not_change_decodability():
     world = noisy(biased(momentum()))
     assert (past_memory(world, True), future_memory(world, True)) == (1, 1)
     assert diameter(world) == diameter(momentum()) == 4

@@ -14,7 +14,7 @@ from vd4rl_pomdp.studies.theory.study import facts
 from vd4rl_pomdp.studies.theory.world import counterexample, distances, echo, momentum, past_memory, period, tiny
 
 
-def test_every_fact_is_computed_and_contradicts_what_is_printed():
+def test_facts_have_computed_values():
     found = [(fact["world"], fact["claimed"], fact["computed"]) for fact in facts()]
     assert found == [
         ("ladder", "1/3", "1"),
@@ -37,7 +37,7 @@ def test_every_fact_is_computed_and_contradicts_what_is_printed():
     ]
 
 
-def test_the_ladder():
+def test_ladder_counterexample():
     """From its first step (0, 0), (1, 0) and (1, 1) lead to the ground; if it is reached at once, only the first."""
     for method in ("fj", "fj+a"):
         found = clash(tiny("ladder"), VIEWS[method], MemoryLengths(1, 0), 2)
@@ -46,7 +46,7 @@ def test_the_ladder():
     assert compare(tiny("ladder"), VIEWS["fj"], MemoryLengths(1, 0), 1).one_step, "up to m, as printed"
 
 
-def test_the_literal_readings_on_one_and_two_states():
+def test_literal_readings_on_tiny_worlds():
     assert clash(tiny("idle"), VIEWS["fj+a literal"], MemoryLengths(0, 0), 1).exact == 1
     assert set(clash(tiny("toggle"), VIEWS["mik+a literal"], MemoryLengths(0, 0), 2).seen) == {"o_t", "a_t+1", "o_t+2"}
 
@@ -58,7 +58,7 @@ def test_the_literal_readings_on_one_and_two_states():
         *(("mik+a literal", world, *mn) for world, mn in ((tiny("hidden switch"), (1, 0)), (counterexample(), (3, 3)))),
     ],
 )
-def test_mik_a_is_right_without_the_leak_and_with_it_where_the_future_decodes_only_so(method, world, m, n):
+def test_mik_a_has_no_clash_if_states_are_decodable(method, world, m, n):
     assert all(clash(world, VIEWS[method], MemoryLengths(m, n), k) is None for k in (1, 2, 3))
 
 
@@ -69,7 +69,7 @@ def merged(world, max_k):
     return {frozenset(pair) for pair in combinations(world.states, 2) if not apart[number[pair[:1]], number[pair[1:]]]}
 
 
-def test_one_encoder_on_true_states_merges_states_of_different_rows_alone():
+def test_state_encoder_merges_only_states_of_different_rows():
     assert not merged(tiny("switch"), 2)
     assert not merged(echo(), 8)
     assert merged(tiny("alternator"), 2) == {frozenset((0, 1))}
@@ -86,7 +86,7 @@ def bounded(view):
 
 
 @pytest.mark.parametrize("m", [0, 1, 3])
-def test_beyond_m_a_forward_jump_is_the_masked_objective_at_a_shorter_gap(m):
+def test_fj_beyond_m_equals_mik_at_a_shorter_gap(m):
     for extra, names in product((1, 2, 4), (("fj+a", "mik+a"), ("fj", "mik"))):
         jump, masked = (VIEWS[name] for name in names)
         t, rows = m + 2, 30
@@ -106,7 +106,7 @@ def is_shorter_gap(world, m, k, actions=True):
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("actions", [True, False])
-def test_a_forward_jump_is_the_multi_step_inverse_of_the_shorter_gap(actions, world):
+def test_fj_beyond_m_is_the_inverse_of_the_shorter_gap(actions, world):
     m = past_memory(world, actions)
     assume(m is not None and m <= 2)
     found = [is_shorter_gap(world, m, k, actions) for k in (m + 1, m + 2)]
@@ -114,7 +114,7 @@ def test_a_forward_jump_is_the_multi_step_inverse_of_the_shorter_gap(actions, wo
     assert False not in found
 
 
-def test_the_shorter_gap_is_told_from_the_printed_one():
+def test_shorter_gap_differs_from_the_printed_one():
     """Where the later window tells its first state, and the gap makes a difference."""
     assert is_shorter_gap(echo(), 1, 3) is True
     assert clash(echo(), VIEWS["fj+a"], MemoryLengths(1, 1), 3) is not None

@@ -148,7 +148,7 @@ def losses_after_swaps(objective: InverseObjective, data: ExactWindows, world: W
     return result
 
 
-def test_a_probe_finds_the_merged_states(papers_world):
+def test_learned_encoders_merge_states_as_predicted(papers_world):
     """Exchange past states between states and see whether predictions mind: only where theory separates the states.
 
     With k = 1 <= m, FJ+A may merge all states. MIK+A must tell x from x+2 and may merge (x, -1) with (x, +1). States of

@@ -20,7 +20,7 @@ def classes(world, method, max_k):
 @settings(max_examples=20, deadline=None)
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("method", ["fj", "fj+a", "mik+a"])
-def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
+def test_coarsest_partition_factors_and_is_coarsest(method, world):
     found = relation(world, VIEWS[method], MemoryLengths(1, 1), (1, 2))
     blocks = found.coarsest()
     assert len(blocks) == len(found.histories)
@@ -32,7 +32,7 @@ def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
 @settings(max_examples=15, deadline=None)
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("method", ["fj+a", "mik+a"])
-def test_conflicts_are_the_pairs_that_no_partition_can_merge(method, world):
+def test_conflicts_are_pairs_that_cannot_merge(method, world):
     found = relation(world, VIEWS[method], MemoryLengths(1, 1), (1, 2))
     conflicts, apart = found.conflicts(), np.arange(len(found.histories))
     for one, other in list(combinations(apart, 2))[:60]:
@@ -40,7 +40,7 @@ def test_conflicts_are_the_pairs_that_no_partition_can_merge(method, world):
         assert merged is not bool(conflicts[one, other])
 
 
-def test_forward_jumps_merge_what_mik_a_must_separate():
+def test_fj_merges_states_that_mik_a_separates():
     """Up to k = D = m = 3, FJ and FJ+A let s^A go; MIK+A has to tell s^A = x from x+2."""
     world = counterexample()
     assert classes(world, "fj", 3) == [0] * 8
@@ -56,7 +56,7 @@ def test_forward_jumps_merge_what_mik_a_must_separate():
     assert max(shares["fj+a"].values()) < 1
 
 
-def test_beyond_m_forward_jumps_separate_these_states_again():
+def test_fj_a_separates_states_beyond_m():
     """At k = m+1 the later window begins at t+1, so FJ+A with k <= 5 cannot merge opposite states either."""
     world = counterexample()
     shares = forced_shares(relation(world, VIEWS["fj+a"], MEMORY, range(1, 6)))
@@ -64,7 +64,7 @@ def test_beyond_m_forward_jumps_separate_these_states_again():
     assert classes(world, "fj+a", 5) == [0, 1, 0, 1, 2, 3, 2, 3]
 
 
-def test_the_past_encoder_alone_may_merge_states_that_act_alike():
+def test_past_encoder_may_merge_equivalent_states():
     """echo: (0, 1) and (2, 0) have the same successors; f can merge them under a policy that treats them alike."""
     world, ks = echo(), range(1, 5)
     even = forced_shares(relation(world, VIEWS["mik+a"], MemoryLengths(1, 1), ks))

@@ -29,7 +29,7 @@ def row_of(study, world, method):
     return next(row for row in study["tables"][world] if row["method"] == method)
 
 
-def test_the_computed_table(shown):
+def test_computed_table(shown):
     study, _ = shown
     correct = {w: [row["method"] for row in rows if row["correct"]] for w, rows in study["tables"].items()}
     assert correct == {
@@ -46,7 +46,7 @@ def test_the_computed_table(shown):
     assert not row_of(study, "counterexample", "fj")["discards"]
 
 
-def test_the_papers_equations_where_their_assumptions_hold(shown):
+def test_equations_that_fail_under_their_assumptions(shown):
     study, _ = shown
     broken = {(row["method"], row["where"]) for row in study["equations"] if row["decodes"] and row["fails_k"]}
     assert broken == {("fj", "k > m"), ("fj+a", "k > m"), ("fj+a literal", "k > m"), ("mik+a literal", "every k")}
@@ -54,7 +54,7 @@ def test_the_papers_equations_where_their_assumptions_hold(shown):
     assert all(row["holds_k"] and not row["fails_k"] for row in early)
 
 
-def test_twenty_printed_entries_fail_where_their_assumptions_hold(shown):
+def test_printed_entries_that_fail_under_their_assumptions(shown):
     """All follow from five facts; what the paper does not claim is not among them."""
     study, _ = shown
     rows = [(row["world"], row["method"], row["printed"]) for row in study["differences"]]
@@ -70,7 +70,7 @@ def test_twenty_printed_entries_fail_where_their_assumptions_hold(shown):
     assert len(rows) == 20
 
 
-def test_noise_changes_no_entropy(shown):
+def test_noise_does_not_change_entropies(shown):
     study, _ = shown
     keys = ("world", "state_dependent", "method", "k")
     plain = {tuple(r[k] for k in keys): r["entropy"] for r in study["comparisons"] if not r["noise"]}
@@ -80,7 +80,7 @@ def test_noise_changes_no_entropy(shown):
         assert row["entropy"] == pytest.approx(plain[tuple(row[k] for k in keys)], abs=1e-12)
 
 
-def test_the_page_stands_alone(shown):
+def test_theory_page_is_self_contained(shown):
     study, out = shown
     assert json.loads((out / "theory.json").read_text()) == study
     text = (out / "index.html").read_text()
@@ -89,7 +89,7 @@ def test_the_page_stands_alone(shown):
     assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
 
 
-def test_the_page_about_runs_has_the_same_section(shown, tmp_path):
+def test_report_includes_the_theory_section(shown, tmp_path):
     study, folder = shown
     run = write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
     text = write_report([run, folder], tmp_path / "out")[0].read_text()
@@ -98,7 +98,7 @@ def test_the_page_about_runs_has_the_same_section(shown, tmp_path):
     assert "finite worlds" not in alone.read_text()
 
 
-def test_studies_that_cannot_be_reported_are_one_line(shown, tmp_path):
+def test_invalid_studies_are_rejected(shown, tmp_path):
     study, folder = shown
     run = write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
     (tmp_path / "theory.json").write_text(json.dumps(study | {"printed": {}}))
@@ -109,7 +109,7 @@ def test_studies_that_cannot_be_reported_are_one_line(shown, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
+def test_terminal_tables_match_the_study(shown, monkeypatch, capsys):
     study, _ = shown
     monkeypatch.setattr("vd4rl_pomdp.studies.theory.theory_study", lambda: study)
     main(["theory"])
@@ -123,7 +123,7 @@ def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
             assert words in text
 
 
-def test_the_documentation_shows_the_computed_numbers(shown):
+def test_documentation_matches_the_study(shown):
     study, _ = shown
     text = (Path(__file__).parents[3] / "docs" / "theory.md").read_text()
     for row in table_rows(study):

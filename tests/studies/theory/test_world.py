@@ -37,7 +37,7 @@ def small(**changes):
         ({"actions": []}, "at least one state"),
     ],
 )
-def test_a_bad_world_is_one_line(changes, message):
+def test_invalid_worlds_are_rejected(changes, message):
     with pytest.raises(UserError, match=message) as error:
         small(**changes)
     assert "small" in str(error.value)
@@ -75,7 +75,7 @@ ALL = [(kind, j) for j in range(3) for kind in ("s", "xi", "o", "a")]
 
 @settings(max_examples=25, deadline=None)
 @given(worlds())
-def test_the_joint_law_is_that_of_every_single_sequence(world):
+def test_joint_law_matches_brute_force(world):
     exact = brute_force(world, 3)
     assert sum(exact.values()) == 1
     assert as_fractions(joint_law(world, ALL)) == exact
