@@ -1,13 +1,11 @@
-"""One thread a process: the tests run on several processes, and small tensors gain nothing from more.
+"""Global settings of the test session.
 
-JAX compiles without most optimisations: the tests compile much and run little of it. Ctrl-C is answered, also where
-the tests were started in the background of a shell, which lets its jobs ignore it. Submitit is loaded first:
-it sets up logging, which closes the stream of absl's handler unless that is stderr. Within a test that captures stderr
-itself it is not, but pytest's own, and every later test would fail.
+Each process uses one thread, since tests run in several processes on small tensors. JAX compiles without most
+optimisations, because tests compile much and run little. SIGINT gets its default handler, which background jobs of a
+shell ignore. Submitit is imported before any test captures stderr: its logging setup closes the stream of absl's
+handler unless that is stderr.
 
-GPUs are hidden, unless `-m gpu` chooses the tests that need one.
-
-Where a process crashed is told at the end: what it writes at that moment is lost among the dots.
+GPUs are hidden unless `-m gpu` selects the tests that need one. Tracebacks of crashed processes are printed at the end.
 """
 
 import faulthandler
@@ -18,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import sklearn.cluster  # noqa: F401  loaded once here, and not by a process for each codebook
+import sklearn.cluster  # noqa: F401  imported once, and not by a subprocess for each codebook
 import torch
 
 from tests.helpers_data import write_fake_set
@@ -35,7 +33,7 @@ CRASHES = Path(__file__).parents[1] / ".pytest_cache" / "crashes"
 
 
 def pytest_configure(config):
-    """A GPU rounds from run to run, and tests ask for equality to the bit."""
+    """Tests need bit-exact results, which a GPU does not give."""
     if config.option.markexpr != "gpu":
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
@@ -62,7 +60,7 @@ def pytest_terminal_summary(terminalreporter):
 
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
-    """Decoded sets go to the test's own folder, and runs record no path of pytest as their command."""
+    """Use a cache in `tmp_path`, and record no path of pytest as the command of runs."""
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
 
@@ -75,8 +73,8 @@ def data(tmp_path) -> Path:
 
 @pytest.fixture
 def encoder(data, own_cache, tmp_path) -> Path:
-    """Folder of an encoder that was pretrained on `data`."""
+    """Folder of an encoder pretrained on `data`."""
     from pretrain.train import pretrain
-    from tests.helpers_stages import smoke_pretrain  # not before: most tests train nothing
+    from tests.helpers_stages import smoke_pretrain  # imported late: most tests train nothing
 
     return pretrain(smoke_pretrain(data, tmp_path / "pretrained")).path / "encoder"

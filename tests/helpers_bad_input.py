@@ -1,4 +1,4 @@
-"""A folder of small valid files, what a command does in it, and what it changes."""
+"""A folder of small valid files, and helpers to run commands in it."""
 
 import contextlib
 import io
@@ -14,7 +14,7 @@ FINETUNE = ["--preset", "smoke", "--updates", "2", "--eval-length", "2", "--work
 
 
 def build_world(folder: Path) -> None:
-    """A set, runs of both stages, one of which was cut, rows of results, and things that are no input of anybody."""
+    """Write a dataset, runs of both stages, an interrupted run, results, and files that are no valid input."""
     write_fake_set(folder / SET, [20, 25, 30], physics_dim=18)
     with contextlib.chdir(folder):
         for words in (
@@ -22,8 +22,8 @@ def build_world(folder: Path) -> None:
             ["finetune", "--encoder", ENCODER, "--data", SET, "--out", RUN, *FINETUNE],
             ["results", "add", "runs", "--out", "results"],
         ):
-            code, told = end_of(words)
-            assert code == 0, told
+            code, stderr = end_of(words)
+            assert code == 0, stderr
         shutil.copytree("runs/pretrained", "cut/pretrained")
         Path("cut/pretrained/timing.json").unlink()
         shutil.rmtree("cut/pretrained/encoder")
@@ -35,18 +35,18 @@ def build_world(folder: Path) -> None:
 
 
 def end_of(words: list[str]) -> tuple[int, str]:
-    """Exit code and stderr of a command line; a traceback is raised here as what it is."""
-    told = io.StringIO()
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(told):
+    """Exit code and stderr of a command line; other exceptions are raised."""
+    stderr = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(stderr):
         try:
             main(words)
         except SystemExit as end:
-            return int(end.code or 0), told.getvalue()
-    return 0, told.getvalue()
+            return int(end.code or 0), stderr.getvalue()
+    return 0, stderr.getvalue()
 
 
 def snapshot(folder: Path) -> dict[Path, tuple[int, int]]:
-    """Every name below a folder, with size and time of what is no folder: a lock may have come and gone in one."""
+    """Size and modification time of all paths below a folder; zero for folders, where locks come and go."""
     return {
         path: (0, 0) if path.is_dir() else ((stat := path.lstat()).st_size, stat.st_mtime_ns)
         for path in folder.rglob("*")

@@ -1,4 +1,4 @@
-"""Small sets in V-D4RL's format whose every value tells its episode and step."""
+"""Small datasets in V-D4RL's format whose values encode their episode and step."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def fake_frame(episode: int, t: int) -> np.ndarray:
 
 
 def frame_identity(frames: Any) -> np.ndarray:
-    """(..., S, 2) pairs (episode, t) of the frames in (..., 3 * S, 84, 84) stacks; fails unless frames are whole."""
+    """(..., S, 2) pairs (episode, t) of the frames in (..., 3 * S, 84, 84) stacks; fails on mixed frames."""
     frames = np.asarray(frames).reshape(*frames.shape[:-3], -1, 3, 84, 84)
-    assert (frames == frames[..., :1, :1]).all(), "a frame is not of one piece"
+    assert (frames == frames[..., :1, :1]).all(), "a frame mixes pixels of several frames"
     planes = frames[..., 0, 0].astype(int)
     return np.stack([planes[..., 0], planes[..., 1] * 256 + planes[..., 2]], -1)
 
@@ -55,7 +55,7 @@ def fake_episode(episode: int, length: int, action_dim: int = 6, complete: bool 
 def fake_rows(
     lengths: Sequence[int], action_dim: int = 6, complete_last: bool = True, physics_dim: int = 0
 ) -> dict[str, np.ndarray]:
-    """Rows of a whole set; `physics`, when asked for, holds (episode, t, 0, ...)."""
+    """Rows of a dataset; `physics`, if requested, holds (episode, t, 0, ...)."""
     last = len(lengths) - 1
     episodes = [fake_episode(i, n, action_dim, complete_last or i < last) for i, n in enumerate(lengths)]
     rows = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
@@ -104,7 +104,7 @@ def rows_of_set(folder: Path) -> dict[str, np.ndarray]:
 
 
 def assert_equal_rows(left: dict[str, np.ndarray], right: dict[str, np.ndarray], but: Sequence[str] = ()) -> None:
-    """Fail unless all keys but some hold the same."""
+    """Assert equal arrays for all keys except `but`."""
     assert left.keys() - set(but) == right.keys() - set(but)
     for key in left.keys() - set(but):
         np.testing.assert_array_equal(left[key], right[key], err_msg=key)

@@ -1,4 +1,4 @@
-"""A Hugging Face Hub on this machine: what huggingface_hub asks of it for repositories, commits and large files."""
+"""A local Hugging Face Hub with the endpoints that huggingface_hub uses for repositories, commits and large files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 
 TOKEN = "hf_writer"
 LARGE = (".safetensors", ".hdf5", ".png")
-"""What the Hub keeps as large files."""
+"""Suffixes stored as large files."""
 
 
 def git_oid(content: bytes) -> str:
@@ -26,13 +26,13 @@ def git_oid(content: bytes) -> str:
 class Repo:
     private: bool = False
     branches: dict[str, list[str]] = field(default_factory=lambda: {"main": []})
-    """Commits of each, oldest first."""
+    """Commits by branch, oldest first."""
     commits: dict[str, dict[str, bytes]] = field(default_factory=dict)
-    """Files of each."""
+    """Files by commit."""
 
     def commit(self, branch: str, files: dict[str, bytes]) -> str:
-        told = [branch, len(self.commits), sorted(files)]
-        name = hashlib.sha1(json.dumps(told).encode()).hexdigest()
+        content = [branch, len(self.commits), sorted(files)]
+        name = hashlib.sha1(json.dumps(content).encode()).hexdigest()
         self.commits[name] = files
         self.branches[branch].append(name)
         return name
@@ -49,21 +49,21 @@ class RefusedError(Exception):
 
 
 class Hub:
-    """Its content, and the faults that a test asks for."""
+    """Repositories, and faults requested by a test."""
 
     def __init__(self) -> None:
         self.repos: dict[str, Repo] = {}
         """By `models/OWNER/NAME` and `datasets/OWNER/NAME`."""
         self.large: dict[str, bytes] = {}
         self.requests: Counter[str] = Counter()
-        """Method and path of each."""
+        """Counts by method and path."""
         self.ranges: list[str] = []
         self.cut: Counter[str] = Counter()
-        """How often a file's answer breaks off in the middle."""
+        """Number of responses to cut in the middle, by file."""
         self.damaged: set[str] = set()
-        """Files that are sent with a wrong byte."""
+        """Files sent with a wrong byte."""
         self.status: dict[str, int] = {}
-        """Statuses with which requests fail, by a part of their path."""
+        """Error statuses by a part of the request's path."""
 
     def files(self, repo: str, revision: str = "main") -> dict[str, bytes]:
         found = self.repos[repo]
@@ -113,8 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
         if cut:
             self.close_connection = True
 
-    def _json(self, told: Any) -> None:
-        self._send(200, json.dumps(told).encode(), {"Content-Type": "application/json"})
+    def _json(self, payload: Any) -> None:
+        self._send(200, json.dumps(payload).encode(), {"Content-Type": "application/json"})
 
     @property
     def _writes(self) -> bool:
@@ -137,8 +137,8 @@ class _Handler(BaseHTTPRequestHandler):
         if not there:
             repo = self.hub.repos[name] = Repo(asked.get("visibility") == "private")
             repo.commit("main", {".gitattributes": b"*.hdf5 filter=lfs\n"})
-        told = {"url": host + name.removeprefix("models/"), "id": name.partition("/")[2]}
-        self._send(409 if there else 200, json.dumps(told).encode(), {"Content-Type": "application/json"})
+        payload = {"url": host + name.removeprefix("models/"), "id": name.partition("/")[2]}
+        self._send(409 if there else 200, json.dumps(payload).encode(), {"Content-Type": "application/json"})
 
     def info(self, kind: str, name: str, revision: str | None, body: bytes) -> None:
         repo = self._repo(f"{kind}/{name}")
@@ -201,8 +201,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def yaml(self, body: bytes) -> None:
         wrong = 'license: "nobody\'s"' in json.loads(body)["content"]
-        told = json.dumps({"errors": [{"message": '"license" must be one of [mit]'}] if wrong else [], "warnings": []})
-        self._send(400 if wrong else 200, told.encode(), {"Content-Type": "application/json"})
+        payload = json.dumps(
+            {"errors": [{"message": '"license" must be one of [mit]'}] if wrong else [], "warnings": []}
+        )
+        self._send(400 if wrong else 200, payload.encode(), {"Content-Type": "application/json"})
 
     def file(self, name: str, revision: str, path: str, body: bytes) -> None:
         repo = self._repo(name if name.startswith("datasets/") else f"models/{name}")

@@ -1,4 +1,4 @@
-"""The files that the documentation's pages on parts of one's own write, as scripts and as modules."""
+"""The examples of the documentation's pages on plug-ins, as scripts and modules."""
 
 import importlib.util
 import re
@@ -16,18 +16,18 @@ from vd4rl_pomdp.core.registry import REGISTRIES
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = {f"my_{page.stem.split('_', 2)[2]}.py": page for page in sorted(DOCS.glob("add_a*.md"))}
-"""Name of the file and the page, whose first block it holds."""
+"""File name and page; the file is the page's first block."""
 
 
 def write_example(file: str, folder: Path) -> Path:
-    """Write a page's file into a folder."""
+    """Write a page's example into a folder."""
     script = folder / file
     script.write_text(re.findall(r"```python\n(.*?)```", PAGES[file].read_text(), re.DOTALL)[0])
     return script
 
 
 def load_example(file: str, folder: Path, patch: pytest.MonkeyPatch) -> ModuleType:
-    """Import a page's file, which registers its parts; its flags are described by its source."""
+    """Import a page's example, which registers its plug-ins; help texts are read from its source."""
     name = file.removesuffix(".py")
     spec = importlib.util.spec_from_file_location(name, write_example(file, folder))
     module = importlib.util.module_from_spec(spec)
@@ -38,7 +38,7 @@ def load_example(file: str, folder: Path, patch: pytest.MonkeyPatch) -> ModuleTy
 
 @contextmanager
 def isolated_registries() -> Iterator[None]:
-    """Within the block parts of all kinds may be registered; after it they are forgotten."""
+    """Plug-ins registered within the block are removed afterwards."""
     with ExitStack() as stack:
         for registry in REGISTRIES.values():
             stack.enter_context(registry.isolated())

@@ -1,4 +1,4 @@
-"""A small world of pictures whose state is known: a ball on a marked floor, moved by each action."""
+"""A small dataset of images with known state: a ball on a marked floor, moved by each action."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EPISODES, ROWS = 24, 40
 
 
 def picture(position: np.ndarray | None) -> np.ndarray:
-    """(3, 32, 32) uint8: lines on the floor, which tell how a picture was shifted, and a ball, if there is one."""
+    """(3, 32, 32) uint8: lines on the floor, which reveal shifts, and optionally a ball."""
     frame = np.full((3, SIZE, SIZE), 60, np.uint8)
     frame[0, 6:8], frame[1, :, 6:8], frame[2, 24:26], frame[0, :, 24:26] = 160, 160, 200, 120
     if position is not None:
@@ -32,7 +32,7 @@ def picture(position: np.ndarray | None) -> np.ndarray:
 
 
 def _episode(rng: np.random.Generator, ball: bool) -> dict[str, np.ndarray]:
-    """Uniform actions, each of which moves the ball by up to 6 pixels a direction, until the marked lines."""
+    """Uniform actions that move the ball by up to 6 pixels per axis, within the marked lines."""
     action = rng.uniform(-1, 1, (ROWS, 2)).astype(np.float32)
     action[0] = 0
     position = [rng.uniform(LOW, HIGH, 2)]
@@ -51,7 +51,7 @@ def _episode(rng: np.random.Generator, ball: bool) -> dict[str, np.ndarray]:
 
 
 def ball_world(folder: Path, ball: bool = True) -> Dataset:
-    """A set of 24 episodes of 40 rows; `physics` holds the ball's position. Without a ball all pictures are one."""
+    """24 episodes of 40 rows; `physics` holds the ball's position. Without a ball all images are equal."""
     rng = np.random.default_rng(0)
     episodes = [_episode(rng, ball) for _ in range(EPISODES)]
     (folder / "set").mkdir(parents=True)
@@ -61,7 +61,7 @@ def ball_world(folder: Path, ball: bool = True) -> Dataset:
 
 
 def trainer_on(dataset: Dataset, method: str, **settings: Any) -> Trainer:
-    """The training of a method on the ball's world, with its random shifts; small enough for seconds."""
+    """A small trainer of a method on the dataset, with its random shifts."""
     small = {"batch_size": 8, "window": 8, "frame_encoder": "small", "feature_dim": 32, "learning_rate": 1e-3}
     config = PretrainConfig.of("paper", method=method, **(small | settings))
     seed_networks(0, "ball")
@@ -72,7 +72,7 @@ def trainer_on(dataset: Dataset, method: str, **settings: Any) -> Trainer:
 
 @torch.no_grad()
 def position_error(trainer: Trainer) -> float:
-    """Error of a linear probe on the ball's position in unshifted pictures of held-out episodes, % of its deviation."""
+    """Probe error of the ball's position in unshifted images of held-out episodes, % of its standard deviation."""
     dataset = trainer.batches.view.dataset
     features = trainer.objective.encoder.frame(View(dataset).stacks(torch.arange(dataset.num_rows)))
     return probe_error(features.numpy(), dataset.physics, dataset.episode.numpy())

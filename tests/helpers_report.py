@@ -38,9 +38,9 @@ def write_run(
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         for step, values in scores.items():
-            told = names | {"step": step, "length": 500, "evaluated_under": names["corruption"], "action_error": ""}
+            row = names | {"step": step, "length": 500, "evaluated_under": names["corruption"], "action_error": ""}
             for i, value in enumerate(values):
-                writer.writerow(told | {"episode": i, "episode_seed": 20_000 + i, "return": value * 10, "score": value})
+                writer.writerow(row | {"episode": i, "episode_seed": 20_000 + i, "return": value * 10, "score": value})
     (folder / "timing.json").write_text('{"seconds": 3.0}')
     if film:
         pictures = np.random.default_rng(0).integers(0, 256, (4, 12, 84, 84), dtype=np.uint8)
@@ -63,8 +63,8 @@ def describe(
         facts = {"corruption": corruption, "steps": settings["steps"], "preset": settings["preset"]}
         facts |= {} if encoder_seed is None else {"seed": encoder_seed}
         (run / "encoder").mkdir()
-        told = facts | {"settings": settings, "data": card.get("data", "")}
-        (run / "encoder" / "config.json").write_text(json.dumps({"pretrain": told}))
+        pretraining = facts | {"settings": settings, "data": card.get("data", "")}
+        (run / "encoder" / "config.json").write_text(json.dumps({"pretrain": pretraining}))
     return run
 
 
@@ -94,7 +94,7 @@ def write_seeds(
 
 
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports draw no figures, which takes most of their time."""
+    """Skip figures, which take most of a report's time."""
     sections = ("scores", "lead", "profiles", "curves", "probes", "errors", "costs", "losses")
     monkeypatch.setattr(page, "draw_plots", lambda runs, made: {name: [] for name in sections})
 
@@ -111,7 +111,7 @@ def pretraining(place: Path) -> Path:
 
 
 def pooled(folder: Path) -> dict[str, int]:
-    """Seeds by the label under which a folder's runs are pooled."""
+    """Number of seeds by the label under which a folder's runs are pooled."""
     runs = load_runs([folder])
     return dict(Counter(label(run.named) for run in runs for _ in run.rows))
 
@@ -126,7 +126,7 @@ def grid(tmp_path: Path) -> Path:
 
 
 def finished_result(path: Path, labels: dict[str, Any]) -> Result:
-    """A finished fine-tuning with one evaluation episode, as a results folder tells of it."""
+    """A finished fine-tuning run with one evaluation episode, as read from a results folder."""
     record = {"stage": "finetune", "config": {"seed": labels["seed"]}, "versions": {}, "git_commit": "abc"}
     row = labels | {"step": 10, "episode": 0, "episode_seed": 0, "return": 500.0, "length": 500, "score": 50.0}
     row |= {"evaluated_under": labels["corruption"], "action_error": None}

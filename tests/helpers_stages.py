@@ -1,4 +1,4 @@
-"""The stages in their smallest size, cut and whole, and what their folders hold."""
+"""The stages at their smallest size, interruptions, and the contents of run folders."""
 
 import hashlib
 from dataclasses import fields
@@ -16,7 +16,7 @@ VARYING = ("timing.json", "pretrain_timing.json", "machine.json")
 
 
 def option_names() -> set[str]:
-    """Names of the options of all parts that there are."""
+    """Names of the options of all plug-ins."""
     kinds, found = [Options], set[str]()
     while kinds:
         kind = kinds.pop()
@@ -43,7 +43,7 @@ def _stable(path: Path) -> bytes:
 
 
 def _spelled(node: Any) -> Any:
-    """A state without tensors, whose pickle would tell which words are one object."""
+    """A state with tensors replaced by hashes, since pickles depend on object identity."""
     if isinstance(node, torch.Tensor):
         return str(node.dtype), tuple(node.shape), hashlib.sha256(node.numpy().tobytes()).hexdigest()
     if isinstance(node, dict):

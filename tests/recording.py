@@ -1,7 +1,6 @@
-"""Plays a CUDA graph's part on the CPU: operators are recorded once and run again on the very same tensors.
+"""A CUDA graph's stand-in on the CPU: operators are recorded once and run again on the same tensors.
 
-What a graph would freeze is frozen here, too: Python, numbers read from tensors, random draws. What a graph refuses is
-refused.
+As in a graph, Python code, values read from tensors and random draws are frozen, and the same operations are rejected.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class _Recorder(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        # as they are now: lists may be changed later, and tensors be turned in place
+        # copied now: lists may change later, and tensors be transposed in place
         now = tree_map(lambda x: x.detach() if isinstance(x, Tensor) else x, (args, kwargs))
         name = func.overloadpacket.__name__
         if name in _WAITING:
@@ -71,7 +70,7 @@ class _Recorder(TorchDispatchMode):
                 self._kept.setdefault(storage.data_ptr(), (storage, storage.clone()))
 
     def undo(self) -> None:
-        """As capturing does no work, take back what was written."""
+        """Restore written tensors, since capturing does not execute."""
         for storage, before in self._kept.values():
             storage.copy_(before)
 
@@ -98,7 +97,7 @@ def record(function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
 
 
 class ReplayedAdam(Adam):
-    """Adam on a CPU as it is on a GPU: fused, its learning rate a tensor."""
+    """Adam on a CPU as on a GPU: fused, with its learning rate in a tensor."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float, fused: bool = True) -> None:
         super().__init__(parameters, learning_rate, fused=True)
@@ -107,9 +106,9 @@ class ReplayedAdam(Adam):
 
 
 def replays(patch: pytest.MonkeyPatch, *modules: ModuleType, capture: Any = record) -> None:
-    """Let trainings of modules that name `Replay` and `Adam` run on the CPU as they do on a GPU.
+    """Make modules that import `Replay` and `Adam` train on the CPU as on a GPU.
 
-    With `capture` None they run the same operators without being replayed.
+    With `capture` None the same operators run without replay.
     """
     patch.setattr(hardware, "in_host_memory", lambda x: False)  # numpy's work would not be recorded
     for module in modules:

@@ -1,4 +1,4 @@
-"""An exported agent, loaded in one line, plays its card's episodes to the digit; what is damaged or unknown is told."""
+"""Exported agents reproduce the episodes of their cards; damaged and unknown ones are rejected."""
 
 import io
 import shutil
@@ -50,10 +50,10 @@ def test_agent_copies_its_last_action():
         return chosen.tolist()
 
     assert last_action(spoil=True) == last_action(spoil=False)
-    told = last_action(spoil=False, executed=list)
-    assert told != last_action(spoil=False)
+    expected = last_action(spoil=False, executed=list)
+    assert expected != last_action(spoil=False)
     for executed in (np.asarray, np.float32, torch.tensor):
-        assert last_action(spoil=True, executed=executed) == told
+        assert last_action(spoil=True, executed=executed) == expected
     with pytest.raises(UserError, match="6 finite numbers"):
         agent.set_last_action(np.zeros(3))
 
@@ -70,10 +70,10 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
     assert f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")' in capsys.readouterr().out
     agent = load_agent(str(out))
     card = agent.card
-    told = read_run(run)
-    assert (card["run"], card["seed"], card["method"]) == (told.id, 0, "mik+a")
-    assert card["data"] == told.record["inputs"]["data"]
-    assert card["budget"]["finetuning"]["updates"] == told.files["timing"]["updates"]
+    source = read_run(run)
+    assert (card["run"], card["seed"], card["method"]) == (source.id, 0, "mik+a")
+    assert card["data"] == source.record["inputs"]["data"]
+    assert card["budget"]["finetuning"]["updates"] == source.files["timing"]["updates"]
     assert [row["evaluated_under"] for row in card["episodes"]] == ["patch+zero_frames"] * 2 + ["none"] * 2
     for row in card["episodes"]:
         corruption = CorruptionConfig.fill(card["corruption"] | {"corruption": row["evaluated_under"]})
@@ -85,7 +85,7 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
             rewards.append(now.time_step.reward)
         assert (round(float(np.cumsum(rewards)[-1]), 4), len(rewards)) == (row["return"], row["length"])
     film = tmp_path / "new" / "film.webp"
-    longer = shutil.copytree(out, tmp_path / "longer")  # as if exported from a run with a greater --eval-length
+    longer = shutil.copytree(out, tmp_path / "longer")  # as exported from a run with a larger --eval-length
     write_json(longer / "card.json", card | {"length": 12})
     main(["agents", "play", str(out), str(longer), "--episodes", "2", "--film", str(film), "--workers", "1"])
     head, first, second, less, written = capsys.readouterr().out.splitlines()
@@ -93,7 +93,7 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
     mean = np.mean([row["return"] for row in card["episodes"][:2]])
     assert first == second
     assert first.split("[")[0].split() == ["mik+a,", "seed", "0", f"{mean:.0f}"]
-    assert (less.split()[-1], written) == ("0", f"film: {film}"), "no interval where nothing differs"
+    assert (less.split()[-1], written) == ("0", f"film: {film}"), "no interval without a difference"
     with Image.open(film) as moving:
         assert (moving.n_frames, moving.size) == (2, (4 * 172, 2 * 194))
     for name in FILES:
@@ -104,10 +104,10 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
     with pytest.raises(SystemExit):
         main(["agents", "export", str(run), "--out", str(out)])
     assert f"{out}: is not empty; choose another --out" in capsys.readouterr().err
-    for film, told in ((tmp_path, "is a folder"), (run / "film.webp", "lies inside")):
+    for film, message in ((tmp_path, "is a folder"), (run / "film.webp", "lies inside")):
         with pytest.raises(SystemExit):
             main(["agents", "play", str(out), "--film", str(film)])
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     for name in FILES:
         whole = (out / name).read_bytes()
         (out / name).write_bytes(whole + b" ")
@@ -134,7 +134,7 @@ def test_only_finished_finetuning_runs_are_exported(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     (whole_run(tmp_path / "cut") / "timing.json").unlink()
     pretraining(tmp_path / "pretrained")
-    for name, told in (
+    for name, message in (
         ("cut", "is not a finished fine-tuning run"),
         ("pretrained", "is not a finished"),
         ("empty", "is not a run"),
@@ -142,15 +142,15 @@ def test_only_finished_finetuning_runs_are_exported(tmp_path, capsys):
         with pytest.raises(SystemExit) as ended:
             main(["agents", "export", str(tmp_path / name), "--out", str(tmp_path / "new")])
         assert ended.value.code == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_unknown_agent_lists_shipped_ones(tmp_path):
-    with pytest.raises(UserError) as told:
+    with pytest.raises(UserError) as message:
         load_agent("walker_walk/medium_expert/patch/mine")
-    assert f"or a shipped agent ({', '.join(shipped()) or 'none'})" in str(told.value)
-    assert "\n" not in str(told.value)
+    assert f"or a shipped agent ({', '.join(shipped()) or 'none'})" in str(message.value)
+    assert "\n" not in str(message.value)
 
 
 def test_shipped_agents_reproduce_their_first_episode():

@@ -1,4 +1,4 @@
-"""Wrong values of flags: every command ends in one line and exit code 2, and writes nothing."""
+"""Invalid flag values end every command with one line and exit code 2, and write nothing."""
 
 import contextlib
 import os
@@ -38,7 +38,7 @@ VALID = {
     "sweep run": ["quick", "--testing", "--dry-run", *OUT],
     "theory": OUT,
 }
-"""Words after each command that are right; each test makes one flag's value wrong."""
+"""Valid arguments of each command; each test replaces one value with an invalid one."""
 NO_FILE = ["nowhere", "file/below", "file", "empty", "foreign", "loop", "/dev/null", "n" * 300, os.fsdecode(b"a\xff")]
 WRONG = {
     bool: ["maybe"],
@@ -52,7 +52,7 @@ RIGHT = {
     *((command, "out", "nowhere") for command in VALID),
     *(("sweep run", flag, word) for flag in ("out", "data") for word in ("nowhere", "empty", "foreign")),
 }
-"""What is no bad input: an output folder may be new or empty."""
+"""Valid values: an output folder may be new or empty."""
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def _flags(config: Callable[..., object], default: object) -> dict[str, type]:
 
 @cache
 def wrong() -> list[tuple[str, str, str]]:
-    """Every command, flag of it and wrong value."""
+    """All (command, flag, invalid value)."""
     found = [(command, flag, v) for command in VALID for flag, kind in flags_of(command).items() for v in WRONG[kind]]
     assert {command for command, *_ in found} == set(VALID)
     return [case for case in found if case not in RIGHT]
@@ -111,6 +111,6 @@ def test_invalid_flag_values_print_one_line_and_write_nothing(world, data):
         start = words.index(flag_of(flag))
         del words[start : start + 2]
     before = snapshot(world)
-    code, told = end_of([*words, flag_of(flag), value])
-    assert (code, told.count("\n"), told[:7]) == (2, 1, "error: "), told
+    code, stderr = end_of([*words, flag_of(flag), value])
+    assert (code, stderr.count("\n"), stderr[:7]) == (2, 1, "error: "), stderr
     assert snapshot(world) == before

@@ -1,4 +1,4 @@
-"""Damaged files: the command that reads one works all the same, or ends in one line and exit code 2."""
+"""Commands that read a damaged file either succeed or end with one line and exit code 2."""
 
 import contextlib
 import shutil
@@ -24,7 +24,7 @@ READERS = [
     (["finetune", "--encoder", ENCODER, "--data", SET, *OUT, *FINETUNE], f"{ENCODER}/*"),
     (["pretrain", "--data", SET, "--out", "cut/pretrained", *PRETRAIN], "cut/pretrained/**/*.*"),
 ]
-"""Command lines, and the files that they read."""
+"""Command lines and the files they read."""
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +60,8 @@ def test_damaged_files_are_read_or_rejected_in_one_line(world, tmp_path_factory,
     shutil.copytree(world, folder, symlinks=True, dirs_exist_ok=True)
     (folder / name).write_bytes(damaged)
     with contextlib.chdir(folder):
-        code, told = end_of(words)
+        code, stderr = end_of(words)
     shutil.rmtree(folder)
     if code:
-        assert code == 2, told
-        assert [line[:7] for line in told.splitlines() if not line.startswith("warning: ")] == ["error: "], told
+        assert code == 2, stderr
+        assert [line[:7] for line in stderr.splitlines() if not line.startswith("warning: ")] == ["error: "], stderr

@@ -1,4 +1,4 @@
-"""Code blocks of the README and of docs/: Python is executed, commands are parsed, and run where that takes seconds."""
+"""Code blocks of the README and docs/: Python is executed; commands are parsed, and run if that takes seconds."""
 
 import functools
 import json
@@ -35,7 +35,7 @@ from vd4rl_pomdp.sweeps.stages import check_cells
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = (["vd4rl-pomdp"], *(["python", file] for file in EXAMPLES))
-"""What begins a command of ours."""
+"""First words of this project's commands."""
 NOT_RUN = {
     "make demo": "minutes of rendering and training; tests/cli looks at its commands, the Dockerfile runs them",
     "make test": "runs these tests",
@@ -69,7 +69,7 @@ NOT_RUN = {
     "vd4rl-pomdp certify": "trains for hours; tests/studies trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }
-"""How a line begins that is parsed, if it is ours, but not run, and why."""
+"""Prefixes of commands that are not run, with the reason; those of this project are still parsed."""
 RUN = (
     "vd4rl-pomdp data check",
     "vd4rl-pomdp pretrain",
@@ -84,7 +84,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def commands(page: Path) -> list[str]:
-    """Lines of a page's shell blocks, continued ones joined, comments cut off."""
+    """Lines of a page's shell blocks, with continuations joined and comments removed."""
     lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
     return [" ".join(re.sub(r"(^|\s)#.*", "", line).split()) for line in lines if line.strip()]
 
@@ -97,7 +97,7 @@ def is_run(page: Path, line: str) -> bool:
 
 
 class ParsedError(Exception):
-    """Ends a command after its words were parsed."""
+    """Ends a command after parsing."""
 
 
 @pytest.fixture(autouse=True)
@@ -157,7 +157,7 @@ CHECKS = {
 
 def check_names(config: object) -> None:
     """Names that a command looks up after parsing must exist."""
-    if type(config).__name__ == "NavigationConfig":  # their methods are others, too
+    if type(config).__name__ == "NavigationConfig":  # it has additional methods
         return
     values = config.keywords if isinstance(config, functools.partial) else vars(config)
     for field, check in CHECKS.items():
@@ -169,7 +169,7 @@ def check_names(config: object) -> None:
 
 @pytest.fixture
 def study(tmp_path, monkeypatch) -> Path:
-    """A folder in which the pages' paths exist: sets, and with `encoder` what was pretrained on one of them."""
+    """A working folder with the datasets that pages use; `encoder` adds a pretrained encoder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     for quality in ("expert", "expert_noisy"):
@@ -184,7 +184,7 @@ def encoder(study) -> None:
 
 
 def small(words: list[str]) -> list[str]:
-    """The same command in the smallest size."""
+    """The command at its smallest size."""
     return [{"cpu": "smoke", "paper": "smoke", "20000": "20", "20": "1"}.get(word, word) for word in words]
 
 
@@ -206,7 +206,7 @@ def test_python_blocks_run(page, encoder):
     if page.stem == "use_an_encoder":
         write_agent(Path("runs/mik+a/pretrain"), Path("agents/mik-walker"))
     if page.stem == "reports":
-        Path("results").symlink_to(ROOT / "results")  # the repository's rows, in the folder that the fixture entered
+        Path("results").symlink_to(ROOT / "results")  # the repository's rows
     for number, code in enumerate(blocks(page, "python")):
         exec(compile(code, f"{page.name}, block {number}", "exec"), namespace)
     check_results(page.stem, namespace)
@@ -227,16 +227,16 @@ def test_notebook_runs_and_has_no_outputs(tmp_path, own_cache, monkeypatch):
 
 
 def write_agent(run: Path, folder: Path) -> None:
-    """What `agents export` writes, of a policy that was never trained."""
+    """Write an exported agent with an untrained policy."""
     encoder, card = load_encoder(run / "encoder")
     Policy(encoder.dim, 6, 8).save(run / "policy")
     write_rounded(run, folder)
-    told = {"task": card.task, "method": card.method, "corruption": card.corruption, "sha256": checksums(folder)}
-    write_json(folder / "card.json", told)
+    about = {"task": card.task, "method": card.method, "corruption": card.corruption, "sha256": checksums(folder)}
+    write_json(folder / "card.json", about)
 
 
 def check_results(page: str, names: dict) -> None:
-    """What a page's comments say of its results."""
+    """Check the results that a page's comments state."""
     if page == "use_an_encoder":
         assert (names["card"].method, names["card"].corruption["corruption"]) == ("mik+a", "patch+zero_frames")
         assert names["windows"].obs.shape == (2, 16, 9, 84, 84)
@@ -252,11 +252,11 @@ def check_results(page: str, names: dict) -> None:
         shown = [i for i in range(3) if frames[i].any()]
         assert len(shown) == 2
         rows = 16 if page == "README" else 24
-        assert all((frames[i] != clean[i]).any((0, 2)).sum() == rows for i in shown), "so many rows are black"
+        assert all((frames[i] != clean[i]).any((0, 2)).sum() == rows for i in shown), "number of black rows"
 
 
 def test_toml_blocks_name_entry_point_groups():
-    pages = [page for page in PAGES if page.name not in ("README.md", "sweeps.md")]  # whose blocks are grids
+    pages = [page for page in PAGES if page.name not in ("README.md", "sweeps.md")]  # these contain grids
     assert FORMATS in REGISTRIES.values()
     found = [tomllib.loads(code)["project"]["entry-points"] for page in pages for code in blocks(page, "toml")]
     assert sorted(group for groups in found for group in groups) == sorted(
@@ -281,7 +281,7 @@ TEXTS = [*PAGES, *sorted((ROOT / "results").rglob("*.md")), ROOT / "CHANGELOG.md
 
 
 def anchors(page: Path) -> set[str]:
-    """What GitHub and the site call a page's headings."""
+    """Anchors of a page's headings, as on GitHub and the site."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}

@@ -1,4 +1,4 @@
-"""Encoders and sets go to a Hub and come back as they were; what is not theirs, damaged or refused is one sentence."""
+"""Encoders, datasets and agents survive a round trip over the Hub; foreign, damaged and refused content is reported."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from vd4rl_pomdp.runs.files import write_json
 
 ENCODER, SET = "lab/encoder", "datasets/lab/set"
 WHERE = {ENCODER: "models/lab/encoder", SET: "datasets/lab/set"}
-"""Where the Hub keeps them."""
+"""Their repositories on the Hub."""
 
 
 @pytest.fixture
 def hub(monkeypatch) -> Iterator[Hub]:
-    """A Hub that huggingface_hub takes for the real one, and the token of one who may write there."""
+    """A local Hub that huggingface_hub uses, with a token that may write."""
     hub = Hub()
     server = hub.serve()
     monkeypatch.setenv("HF_ENDPOINT", f"http://127.0.0.1:{server.server_port}")
@@ -63,7 +63,7 @@ def data(tmp_path) -> Path:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Files of a folder, but for hidden ones."""
+    """Files of a folder, except hidden ones."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
@@ -88,7 +88,7 @@ def test_encoder_round_trip_over_the_hub(hub, encoder, tmp_path):
 def test_dataset_round_trip_over_the_hub(hub, data, tmp_path):
     push(data, SET)
     assert set(hub.files(WHERE[SET])) == {*content(data), "README.md", LISTING, ".gitattributes"}
-    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {"notes.txt": b"the owner's own"})
+    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {"notes.txt": b"the owner's notes"})
     (data / "card.png").unlink()
     push(data, SET)
     assert "card.png" not in hub.files(WHERE[SET])
@@ -250,9 +250,9 @@ def test_failed_push_leaves_the_repository_unchanged(hub, encoder, monkeypatch, 
     save_encoder(encoder, make("gru", True), replace(CARD, seed=1))
     before = hub.files(WHERE[ENCODER])
     hub.status = {path: status}
-    with pytest.raises(UserError, match=f"lab/encoder: the Hub refused or did not answer .*{status}") as told:
+    with pytest.raises(UserError, match=f"lab/encoder: the Hub refused or did not answer .*{status}") as message:
         push(encoder, ENCODER)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(message.value)
     assert hub.files(WHERE[ENCODER]) == before
 
 
@@ -270,9 +270,9 @@ def test_hub_commands(hub, encoder, tmp_path, capsys):
     main(["hub", "push", str(encoder), "lab/encoder", "--private", "--revision", "v1"])
     assert "/models/lab/encoder/commit/" in capsys.readouterr().out
     new = str(tmp_path / "new")
-    for told in ("downloaded and verified", "already present and verified"):
+    for message in ("downloaded and verified", "already present and verified"):
         main(["hub", "pull", "lab/encoder", new, "--revision", "v1"])
-        assert tuple(capsys.readouterr()) == (f"{new}: {told}\n", "")
+        assert tuple(capsys.readouterr()) == (f"{new}: {message}\n", "")
     with pytest.raises(SystemExit) as ended:
         main(["hub", "pull", "lab/nothing", new])
     assert ended.value.code == 2

@@ -1,4 +1,4 @@
-"""Every stage: full disks, signals, second starts and changed inputs cost nothing but the time to start again."""
+"""All stages survive full disks, signals, concurrent starts and changed inputs, and resume bit-exactly."""
 
 import errno
 import multiprocessing
@@ -70,13 +70,13 @@ def encoder(data, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def finetuned(data, encoder, tmp_path_factory) -> Path:
-    """A whole run with `FINETUNE`."""
+    """A finished run with `FINETUNE`."""
     return run_finetune(smoke_finetune(encoder, data, tmp_path_factory.mktemp("finetuned") / "run", **FINETUNE)).path
 
 
 @pytest.fixture(scope="module")
 def maze(tmp_path_factory) -> Path:
-    """A maze's set of noise: nothing here depends on what is seen."""
+    """A maze dataset with random frames."""
     folder, rng, rows = tmp_path_factory.mktemp("maze"), np.random.default_rng(0), 120
     step_type = np.tile([0, *[1] * 28, 2], 4)
     write_shard(
@@ -95,7 +95,7 @@ def maze(tmp_path_factory) -> Path:
 
 
 Stage = tuple[Callable[[Any], Any], Callable[[Path], Any], Any]
-"""What runs, its config for a folder, and the class whose `update` is one step."""
+"""The stage's function, its config for a folder, and the class whose `update` is one step."""
 
 
 @pytest.fixture(params=["pretrain", "finetune", "navigation"], scope="module")
@@ -120,7 +120,7 @@ def whole(stage, tmp_path_factory) -> dict[str, str]:
 
 
 def at_update(monkeypatch, learner: Any, number: int, then: Callable[[], None]) -> None:
-    """Do something in the middle of a run's update of that number."""
+    """Call `then` at the start of a run's update `number`."""
     update, calls = learner.update, []
 
     def changed(self, *arguments):
@@ -145,7 +145,7 @@ def test_run_resumes_bit_exactly_after_sigterm(stage, whole, tmp_path, monkeypat
 
 
 def test_run_resumes_bit_exactly_after_sigkill(stage, whole, tmp_path):
-    """Between two checkpoints, by a signal that no process can handle."""
+    """Killed between two checkpoints."""
     run, config, learner = stage
 
     def killed() -> None:
@@ -162,7 +162,7 @@ def test_run_resumes_bit_exactly_after_sigkill(stage, whole, tmp_path):
 
 
 def rows_of_means(steps: list[dict[str, torch.Tensor]], every: int) -> list[dict[str, float]]:
-    """Means of each scalar over the steps that gave it, of every so many steps and of what is left at the end."""
+    """Means of each scalar over the steps that logged it, for every `every` steps and the rest."""
     rows = []
     for start in range(0, len(steps), every):
         part = steps[start : start + every]
@@ -173,7 +173,7 @@ def rows_of_means(steps: list[dict[str, torch.Tensor]], every: int) -> list[dict
 
 
 def test_metric_rows_are_means_since_the_previous_row(stage, tmp_path, monkeypatch):
-    """Also if a signal ends the run between two rows, at a step that has no checkpoint of its own."""
+    """Also if a signal ends the run between two rows and two checkpoints."""
     run, config, learner = stage
     config = replace(config(tmp_path / "run"), log_every=4, checkpoint_every=3)
     if learner is bc.BC:
@@ -203,7 +203,7 @@ def test_metric_rows_are_means_since_the_previous_row(stage, tmp_path, monkeypat
 
 
 def test_nan_loss_ends_the_run(stage, tmp_path, monkeypatch):
-    """Although its row comes later, and the steps between are finite."""
+    """Later steps are finite, and the row is written later."""
     run, config, learner = stage
     update, calls = learner.update, []
 
@@ -222,7 +222,7 @@ def test_nan_loss_ends_the_run(stage, tmp_path, monkeypatch):
 
 
 def fill_disk(monkeypatch, end: str, number: int) -> None:
-    """Have no space for the `number`-th file whose name has an end, of which only a part is written."""
+    """Fill the disk while writing the `number`-th file whose name ends with `end`."""
     write, calls = Path.write_bytes, []
 
     def limited(path: Path, content: bytes) -> int:
@@ -326,16 +326,16 @@ def test_features_are_encoded_once_over_resumptions(encoder, finetuned, data, tm
         _ENCODED.clear()
         with pytest.raises(UserError):
             run_finetune(config)
-    _ENCODED.clear()  # another process goes on
+    _ENCODED.clear()  # as in another process
     run_finetune(config)
-    assert len(encoded) == 3, "episodes"
+    assert len(encoded) == 3, "one call per episode"
     assert not (config.out / "features.npy").exists()
     assert contents(config.out) == contents(finetuned)
 
 
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])
 def test_interrupted_evaluation_is_repeated(encoder, finetuned, data, tmp_path, monkeypatch, evaluation, rows_written):
-    """Also in the last one, where rows under the run's own corruption alone are not all."""
+    """Also in the last evaluation, which includes clean episodes."""
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     append, evaluations = finetune.trainer.append_episodes, []
 

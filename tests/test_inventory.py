@@ -1,4 +1,4 @@
-"""What users had before the packages were laid out anew, kept, renamed or dropped with a reason: inventory.tsv."""
+"""inventory.tsv lists the interface before a reorganisation: each entry is kept, renamed, or dropped with a reason."""
 
 import contextlib
 import csv
@@ -32,7 +32,7 @@ for row in ROWS:
     if row["status"] == "kept":
         KEPT[row["kind"]].append(row["name"])
 CHOSEN = {"pretrain": PretrainConfig, "finetune": FinetuneConfig, "navigation train": NavigationConfig}
-"""Stages whose help shows the options of what is chosen alone."""
+"""Stages whose help shows only the options of selected plug-ins."""
 
 
 def test_removed_entries_have_a_reason():

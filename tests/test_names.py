@@ -1,4 +1,4 @@
-"""A class or type alias has one meaning: its name is defined once in the project."""
+"""Public classes and type aliases have unique names in the project."""
 
 import ast
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""The documentation's examples of parts of one's own, each executed as it stands; test_own_task has tasks."""
+"""The documentation's examples of user-defined plug-ins are executed; `test_own_task.py` covers tasks."""
 
 import csv
 import json
@@ -30,9 +30,9 @@ EXAMPLES = {
     "frame_encoder": ("tiny", "tiny_channels", 12),
     "history": ("linear", "slowest", 0.9),
 }
-"""Setting that chooses a kind: name of its page's part, an option of its own and a value that is not the default."""
+"""Kind: name of the documented plug-in, one of its options, and a value other than the default."""
 KINDS = {kind: kind.replace("history", "memory") for kind in EXAMPLES}
-"""What pages, files and checks of a kind are called."""
+"""Kind: the word in the names of pages, files and checks."""
 USED_IN = {
     "method": ["pretrain"],
     "corruption": ["pretrain", "finetune"],
@@ -40,12 +40,12 @@ USED_IN = {
     "frame_encoder": ["pretrain", "finetune"],
     "history": ["pretrain", "finetune"],
 }
-"""Kind: the stages that run its code; the first is told of it by name."""
+"""Kind: the stages that run its code; the plug-in is chosen in the first."""
 
 
 @pytest.fixture
 def load(tmp_path, monkeypatch):
-    """Imports a page's file as a module; what it registers is forgotten at the end."""
+    """Imports a page's file as a module; its registrations are removed afterwards."""
     with isolated_registries():
         yield lambda kind: load_example(f"my_{KINDS[kind]}.py", tmp_path, monkeypatch)
 
@@ -61,7 +61,7 @@ def test_documented_plugins_run_in_all_stages_and_are_recorded(load, tmp_path, m
     common = f"--preset smoke --data {data}"
     main(f"pretrain {first} {common} --out {runs}/pretrain".split())
     finetune = f"finetune {second} --encoder {runs}/pretrain/encoder {common} --out {runs}/finetune --eval-episodes 2"
-    main(f"{finetune} --workers 1".split())  # worker processes meet parts of one's own in test_own_task
+    main(f"{finetune} --workers 1".split())  # test_own_task.py covers plug-ins in worker processes
     write_report([runs], tmp_path / "report")
     records = {stage: json.loads((runs / stage / "config.json").read_text()) for stage in ("pretrain", "finetune")}
     for stage in USED_IN[kind]:
@@ -73,10 +73,8 @@ def test_documented_plugins_run_in_all_stages_and_are_recorded(load, tmp_path, m
     assert row.get(kind, name) == name
     rows = list(csv.DictReader((runs / "finetune" / "episodes.csv").open()))
     as_trained = [row for row in rows if row["evaluated_under"] == row["corruption"]]
-    assert len(as_trained) == 2 * 2, "two evaluations of two"
-    assert len(rows) - len(as_trained) == (0 if as_trained[0]["corruption"] == "none" else 2), (
-        "the last one is clean, too"
-    )
+    assert len(as_trained) == 2 * 2, "two evaluations of two episodes"
+    assert len(rows) - len(as_trained) == (0 if as_trained[0]["corruption"] == "none" else 2), "clean evaluation"
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
@@ -113,13 +111,13 @@ def test_wrong_visible_set_of_documented_method_is_caught(load):
 
 
 def option_called(name: str, base: type[Options] = Options) -> type[Options]:
-    """A class with one option more, that is a stage, too."""
+    """An options class with one more option, which is also a corruption stage."""
     fields = {"__annotations__": {name: int}, name: 3, "__call__": lambda self, frames, key, number: None}
     return dataclass(frozen=True)(type("Mine", (base,), fields))
 
 
 def part_with(kind: str, options: object) -> object:
-    """A part of a kind whose options are what is given."""
+    """A plug-in of a kind with the given options class."""
     if kind == "method":
         return Method(METHODS["curl"].build, options=options)
     if kind == "frame_encoder":
@@ -134,7 +132,7 @@ def registries():
 
 
 @pytest.mark.parametrize(
-    ("kind", "options", "told"),
+    ("kind", "options", "message"),
     [
         *(
             (kind, str, "'mine': its options are .*: name a dataclass")
@@ -145,8 +143,8 @@ def registries():
         ("frame_encoder", Options, "name a dataclass that is derived from .*frame.FrameOptions"),
     ],
 )
-def test_invalid_options_classes_are_rejected(registries, kind, options, told):
-    with pytest.raises(UserError, match=told):
+def test_invalid_options_classes_are_rejected(registries, kind, options, message):
+    with pytest.raises(UserError, match=message):
         registries[kind].register("mine", part_with(kind, options))
 
 
@@ -164,10 +162,12 @@ def test_invalid_options_classes_are_rejected(registries, kind, options, told):
 def test_conflicting_option_names_are_rejected(registries, capsys, kind, option, owner):
     options = option_called(option, FrameOptions if kind == "frame_encoder" else Options)
     registries[kind].register("mine", part_with(kind, options))
-    told = rf"({owner} and Mine|Mine and {owner}) both have the setting '{option}', so --.* would be ambiguous: rename"
+    message = (
+        rf"({owner} and Mine|Mine and {owner}) both have the setting '{option}', so --.* would be ambiguous: rename"
+    )
     stage, config = ("finetune", FinetuneConfig) if kind == "algorithm" else ("pretrain", PretrainConfig)
     chosen = {kind: "mine"} | ({"corruption": "patch"} if option == "patch_size" else {})
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         config.of(**chosen)
     with pytest.raises(SystemExit) as end:
         main([stage, *(f"--{name.replace('_', '-')}={value}" for name, value in chosen.items())])

@@ -1,4 +1,4 @@
-"""The documentation's example of tasks of one's own, executed as it stands, and what its environment shows."""
+"""The documentation's example of user-defined tasks is executed in all stages."""
 
 import csv
 import json
@@ -44,7 +44,7 @@ def tasks():
 
 
 def test_documented_task_runs_in_all_stages(tasks, tmp_path):
-    """Worker processes import the file and meet the task in the fine-tuning's episodes; all else is this process's."""
+    """Fine-tuning runs as a script, whose worker processes import the task; other stages run in this process."""
     script, data, runs = tmp_path / "my_task.py", tmp_path / "centre" / "random", tmp_path / "runs"
     script.write_text(CODE)
     for line in (
@@ -65,7 +65,7 @@ def test_documented_task_runs_in_all_stages(tasks, tmp_path):
 
 
 def trained(data: Path, out: Path, method: str = "mik+a", **settings: object) -> FinetuneConfig:
-    """Pretrain at smoke size; the settings of a fine-tuning on that encoder."""
+    """Pretrain at smoke size, and return a fine-tuning config for the encoder."""
     encoder = run_pretrain(PretrainConfig.of("smoke", data=data, out=out / "pretrain", method=method)).path / "encoder"
     return FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out / "run", workers=1, **settings)
 
@@ -91,9 +91,8 @@ def test_state_reference_needs_simulator_states(tasks, tmp_path):
         collect(CollectConfig(name, "random", tmp_path / name, episodes=2, workers=1, frame_size=32), 8)
     config = PretrainConfig.of("smoke", method="state", out=tmp_path / "run", data=tmp_path)
     run = run_pretrain(replace(config, data=tmp_path / "cartpole_swingup"))
-    assert load_encoder(run.path / "encoder")[0].config.channels == 5, (
-        "place of the cart, sine and cosine of the pole, two velocities"
-    )
+    # position of the cart, sine and cosine of the pole's angle, two velocities
+    assert load_encoder(run.path / "encoder")[0].config.channels == 5
     with pytest.raises(UserError, match="centre: stores no simulator states"):
         run_pretrain(replace(config, data=tmp_path / "centre", out=tmp_path / "none"))
 
@@ -105,13 +104,13 @@ def test_termination_is_stored_in_the_last_row(tasks, tmp_path):
     starts = np.flatnonzero(rows["step_type"] == 0)
     lengths = np.diff([*starts, len(rows["reward"])])
     ended = lengths < 31
-    assert 0 < ended.sum() < 30, "some episodes reach the middle, some the limit"
+    assert 0 < ended.sum() < 30, "some episodes terminate, some reach the time limit"
     last = starts + lengths - 1
     assert (rows["step_type"][last] == 2).all()
     assert (rows["discount"][last] == np.where(ended, 0.0, 1.0)).all()
     assert (np.delete(rows["discount"], last) == 1).all()
     assert "physics" not in rows
-    assert (rows["reward"][last][ended] > 0.8).all(), "in the middle the reward is largest"
+    assert (rows["reward"][last][ended] > 0.8).all(), "terminal rows have the largest reward"
     dataset = open_dataset(tmp_path / "set")
     assert View(dataset).transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
 
@@ -134,7 +133,7 @@ def test_impossible_collections_write_nothing(tasks, tmp_path, changes, message)
 
 
 @pytest.mark.parametrize(
-    ("task", "told"),
+    ("task", "message"),
     [
         (GymnasiumTask("Centre-v0", pixels="Render"), "unknown pixels 'Render'"),
         (GymnasiumTask("Centre-v0", action_noise=-1.0), "its action_noise is -1.0: it must be 0 or a positive number"),
@@ -143,8 +142,8 @@ def test_impossible_collections_write_nothing(tasks, tmp_path, changes, message)
         (DMCTask("cartpole", "swingup", camera="side"), "its camera is 'side': it must be the camera's number"),
     ],
 )
-def test_invalid_tasks_are_rejected_on_registration(tasks, task, told):
-    with pytest.raises(UserError, match=f"task 'mine': {told}"):
+def test_invalid_tasks_are_rejected_on_registration(tasks, task, message):
+    with pytest.raises(UserError, match=f"task 'mine': {message}"):
         TASKS.register("mine", task)
 
 
@@ -177,7 +176,7 @@ def test_evaluation_covers_whole_episodes_of_long_tasks(tasks, tmp_path):
     collect(CollectConfig("long", "random", data, episodes=2, workers=1, frame_size=50), 60)
     config = trained(data, tmp_path, "random", updates=2, eval_every=2, eval_length=500, eval_clean=False)
     run = run_finetune(config)
-    assert run_finetune(config).finished, "the same command finds it"
+    assert run_finetune(config).finished, "the same command finds the finished run"
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {510}
     assert json.loads((run.path / "config.json").read_text())["config"]["eval_length"] == 510
     assert {row["length"] for row in evaluate_run(run.path, None, 1, 1)[0]} == {510}
@@ -213,9 +212,9 @@ def test_changed_task_code_does_not_resume_a_collection(tmp_path):
             return collect(config, 8)
 
     first, second = collect_by(CODE)
-    told = json.loads((tmp_path / "set" / "collection.json").read_text())["sources"]
-    assert told == {"task centre": f"my_task.py {sha256(CODE.encode()).hexdigest()[:12]}"}
-    assert collect_by(CODE + "# changed\n") == [first, second], "a set that is whole stays one"
+    sources = json.loads((tmp_path / "set" / "collection.json").read_text())["sources"]
+    assert sources == {"task centre": f"my_task.py {sha256(CODE.encode()).hexdigest()[:12]}"}
+    assert collect_by(CODE + "# changed\n") == [first, second], "a complete dataset is accepted"
     for path in (second, tmp_path / "set" / "provenance.json"):
         path.unlink()
     with pytest.raises(UserError, match=r"set: is unfinished, and the code of task centre has changed since"):

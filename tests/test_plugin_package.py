@@ -1,4 +1,4 @@
-"""An installed package that offers one part of each kind: found by the command line, in the record, and checked."""
+"""An installed package with one plug-in of each kind is found by the command line and recorded."""
 
 import json
 import os
@@ -115,13 +115,13 @@ PARTS = {
     "frame_encoder": ("wide", "WIDE", "stride_of_first", 6),
     "task": ("dot", "TASK", None, None),
 }
-"""Kind: name, object, an option of its own and a value that is not the default."""
+"""Kind: name, object, one of its options, and a value other than the default."""
 ORIGIN = "their-parts 1.2"
 
 
 @pytest.fixture
 def python(tmp_path):
-    """Runs Python words where the package is installed; gives what was printed."""
+    """Runs Python with the package installed and returns its stdout."""
     site = tmp_path / "site"
     info = site / "their_parts-1.2.dist-info"
     info.mkdir(parents=True)
@@ -145,7 +145,7 @@ def python(tmp_path):
 
 
 def chosen(*kinds: str) -> list[object]:
-    """Flags that choose the package's parts of some kinds, and set their options."""
+    """Flags that choose the package's plug-ins of the given kinds and set their options."""
     words: list[object] = []
     for kind in kinds:
         name, _, option, value = PARTS[kind]
@@ -172,7 +172,7 @@ def test_installed_plugins_are_found_and_recorded_with_version(python, tmp_path)
             assert name in record["config"].values()
             assert option is None or record["config"][option] == value
     rows = (out / "finetune" / "episodes.csv").read_text().splitlines()[1:]
-    assert len(rows) == 6, "two evaluations of two, the last one clean, too"
+    assert len(rows) == 6, "two evaluations of two episodes, and a clean one"
     assert all(",dot," in row and ",slow_bc," in row and ",column," in row for row in rows)
     listed = {line.split()[0]: line for line in python("-m", "vd4rl_pomdp", "list").splitlines() if line.strip()}
     assert all(listed[name].endswith(f"[{ORIGIN}]") for name, *_ in PARTS.values())

@@ -1,4 +1,4 @@
-"""What documentation and layout promise, checked on the tracked files."""
+"""Layout, dependencies and documentation, checked on the tracked files."""
 
 import ast
 import pydoc
@@ -26,18 +26,18 @@ PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
 PACKAGE, OURS = ROOT / "vd4rl_pomdp", "vd4rl_pomdp."
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 ROOF = ("cli", "sweeps", "studies", "theory", "testing", "bench", "hub")
-"""Rooms of vd4rl_pomdp that may import everything; the stages and the other rooms, the ground, import none of them."""
+"""Subpackages of vd4rl_pomdp that may import everything; the stages and other subpackages import none of them."""
 MAY_IMPORT = {
     "baselines": {"baselines"},
     "pretrain": {"pretrain", "baselines"},
     "finetune": {"finetune"},
     "ground": set(),
 }
-"""Of the stages' packages, what a package imports; the ground everybody does."""
+"""Packages that each package may import, besides the ground."""
 
 
 def everywhere(tree: ast.AST) -> set[str]:
-    """Names of the modules that a module imports, whenever it does."""
+    """Names of all modules that a module imports, including late imports."""
     names = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -48,7 +48,7 @@ def everywhere(tree: ast.AST) -> set[str]:
 
 
 def room(module: str) -> str:
-    """The package of a module; of vd4rl_pomdp roof or ground."""
+    """The package of a module; roof or ground within vd4rl_pomdp."""
     package, _, rest = module.partition(".")
     return package if package != "vd4rl_pomdp" else "roof" if rest.split(".")[0] in ROOF else "ground"
 
@@ -78,7 +78,7 @@ def test_imports_are_acyclic():
         names = everywhere(ast.parse(path.read_text()))
         imported = {name if name in modules else name.rpartition(".")[0] for name in names}
         graph[module] = imported & modules.keys() - {module}
-    TopologicalSorter(graph).prepare()  # names the circle, if there is one
+    TopologicalSorter(graph).prepare()  # raises with the cycle
 
 
 def test_modules_have_docstrings():

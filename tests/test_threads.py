@@ -1,4 +1,4 @@
-"""Threads of torch that wait for each other sleep, unless the user says otherwise; its OpenMP library tells it."""
+"""Waiting OpenMP threads of torch sleep unless the user sets another policy."""
 
 import os
 import re
@@ -21,10 +21,10 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess:
 
 
 def spins(code: str, **environment: str) -> set[str]:
-    """How often threads look before they sleep, in every OpenMP library that the code loads."""
+    """Spin counts of waiting threads in every OpenMP library that the code loads."""
     found = set(re.findall("GOMP_SPINCOUNT = '(.*)'", run(code, OMP_DISPLAY_ENV="VERBOSE", **environment).stderr))
     if not found:
-        pytest.skip("torch's OpenMP library is another one here")
+        pytest.skip("torch uses another OpenMP library")
     return found
 
 

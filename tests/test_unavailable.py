@@ -1,4 +1,4 @@
-"""What cannot be opened for the moment is neither damaged nor to be deleted, whichever library opens it: it passes."""
+"""Files that cannot be opened temporarily are reported as such, and not as damaged, by every reader."""
 
 import errno
 import fcntl
@@ -37,12 +37,12 @@ from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import read_plan
 
 ADVICE = ("damaged", "truncated", "delete", "download", "collect", "remove", "train", "replace", "another copy")
-"""What may not be said of a whole file."""
+"""Words that must not be used for an undamaged file."""
 
 
 @contextmanager
 def no_more_files() -> Iterator[None]:
-    """This process has as many open files as it may."""
+    """Set the limit of open files to those already open."""
     lowest = os.open("/dev/null", os.O_RDONLY)
     os.close(lowest)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -55,7 +55,7 @@ def no_more_files() -> Iterator[None]:
 
 @pytest.fixture
 def world(tmp_path) -> dict[str, Callable[[], object]]:
-    """What reads a file of every kind, each of which is whole."""
+    """Readers of all kinds of files, with valid files."""
     data = write_fake_set(tmp_path / "walker_walk" / "expert", (20, 25))
     shard, cache = min(data.glob("*.hdf5")), tmp_path / "cache"
     store = open_dataset(data, cache).store
@@ -110,14 +110,13 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
 def test_too_many_open_files_is_reported_as_temporary(world):
     wrong = {}
     for name, read in world.items():
-        with suppress(UserError) if name in ("plan of a sweep", "results") else nullcontext():  # mere JSON
-            read()  # which also imports what it needs
+        with suppress(UserError) if name in ("plan of a sweep", "results") else nullcontext():  # only valid as JSON
+            read()  # also imports dependencies
         try:
             with no_more_files():
                 read()
         except UnavailableError as error:
-            said = [word for word in ADVICE if word in str(error)]
-            if said or "too many open files" not in str(error):
+            if any(word in str(error) for word in ADVICE) or "too many open files" not in str(error):
                 wrong[name] = str(error)
         except Exception as error:
             wrong[name] = repr(error)
@@ -160,7 +159,7 @@ def test_locked_shard_is_reported_as_temporary(shard, own_cache):
         with pytest.raises(UnavailableError, match="HDF5_USE_FILE_LOCKING=FALSE"):
             read_rows(shard)
         end = run_to_end(["data", "check", str(shard.parent)])
-        assert end.code == TEMPORARY, "what a sweep tries again"
+        assert end.code == TEMPORARY, "sweeps retry this exit code"
         assert kept_in(shard.parent) == "a data set"
     assert run_to_end(["data", "check", str(shard.parent)]).code == 0
 
@@ -177,7 +176,7 @@ def test_shard_being_written_is_not_reported_as_damaged(tmp_path):
 @pytest.mark.parametrize("place", ["File", "_hl.group.h5o.open"])
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENFILE, errno.EBUSY])
 def test_hdf5_system_errors_are_reported_as_temporary(shard, monkeypatch, place, number):
-    """h5py raises a KeyError for what fails below an open file, which `get` of its groups takes for no such key."""
+    """Within an open file h5py raises a KeyError, which `Group.get` treats as a missing key."""
     words = f"Unable to synchronously open object (file read failed: time = now\n, errno = {number}, buf = 0x0)"
 
     def fail(*_: object, **__: object) -> None:
@@ -194,9 +193,9 @@ def test_damage_and_permissions_are_not_temporary(shard):
     with pytest.raises(UserError, match="truncated, damaged") as damaged:
         read_rows(shard)
     assert not isinstance(damaged.value, UnavailableError)
-    told = system_error(shard, PermissionError(errno.EACCES, "Permission denied"))
-    assert type(told) is UserError
-    assert "ask its owner" in str(told)
+    denied = system_error(shard, PermissionError(errno.EACCES, "Permission denied"))
+    assert type(denied) is UserError
+    assert "ask its owner" in str(denied)
     for error in (OSError("image file is truncated"), FileNotFoundError(errno.ENOENT, "none"), ValueError("no array")):
         assert system_error(shard, error) is None
 

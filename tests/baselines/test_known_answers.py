@@ -42,7 +42,7 @@ def finite_windows(batch: int, rows: int, noise: float, g: torch.Generator) -> t
 
 
 def train(objective: torch.nn.Module, steps: int, noise: float, batch: int = 64, rows: int = 4) -> float:
-    """Train on fresh walks; mean loss of the last tenth."""
+    """Train on fresh walks and return the mean loss of the last tenth."""
     g = torch.Generator().manual_seed(0)
     optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
     losses = []
@@ -87,7 +87,7 @@ def test_homer_imposters_are_uniform_over_next_states():
     assert len(following) == 8
     assert all(torch.equal(a, b) for a, b in zip(given[0][:2], given[1][:2], strict=True)), "the same (o_t, a_t)"
     drawn = torch.stack([(other[2][:, None] == following[None]).all(-1).int() for other in given[1::2]])
-    assert (drawn.sum(2) == 1).all(), "each is one of them"
+    assert (drawn.sum(2) == 1).all(), "each imposter is one of the next states"
     assert ((drawn.float().mean(0) - 1 / 8).abs() < 0.11).all()
 
 
@@ -110,7 +110,7 @@ def test_info_nce_excludes_candidates_of_the_same_group():
 
 
 def test_driml_reaches_the_optimal_loss_only_with_actions():
-    """With k = 1 and no noise the best scores single out the true next state: the loss is log(its copies)."""
+    """With k = 1 and no noise the optimal loss is log(number of copies of the true next state)."""
     rows, batch = 2, 64
     g = torch.Generator().manual_seed(9)
     following = [finite_windows(batch, rows, 0.0, g)[1][:, 1] for _ in range(20)]
@@ -126,7 +126,7 @@ def test_driml_reaches_the_optimal_loss_only_with_actions():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_driml_anchors_are_state_and_action(seed: int):
-    """psi(s_t, a_t) against phi(s_{t+k}): in windows of T rows, a_0..a_{T-1-k} count and the later ones do not."""
+    """psi(s_t, a_t) against phi(s_{t+k}): in windows of T rows only a_0..a_{T-1-k} affect the loss."""
     rows, objective = 4, DRIML(encoder(), None, DRIMLOptions(3), seed)
     window, _ = finite_windows(8, rows, 0.0, torch.Generator().manual_seed(0))
     plain, logs = copy.deepcopy(objective).loss(window, 0.0)
@@ -163,7 +163,7 @@ def test_driml_terms_have_separate_projections(term: str):
 
 
 def test_driml_scores_are_clipped_and_negatives_are_all_others():
-    """With scores of one size, 20, for every candidate but 18 for the own, the loss tells how many others there are."""
+    """With the score 20 for all candidates except 18 for the positive, the loss reveals the number of negatives."""
     objective, (window, _) = (
         DRIML(encoder(), None, DRIMLOptions(1), 0),
         finite_windows(4, 6, 0.0, torch.Generator().manual_seed(0)),
@@ -180,7 +180,7 @@ def test_driml_scores_are_clipped_and_negatives_are_all_others():
         assert 19.9 < scores.min() <= scores.max() <= 20
     objective._scores = lambda *given: torch.full((1, 20, 20), 20.0) - 2 * torch.eye(20)
     expected = math.log(19 * math.exp(2.0) + 1)
-    assert objective.loss(window, 0.0)[0].item() == pytest.approx(expected), "those of the own window count, too"
+    assert objective.loss(window, 0.0)[0].item() == pytest.approx(expected), "rows of the same window are negatives"
 
 
 def test_driml_local_features_are_map_positions():
@@ -223,12 +223,12 @@ def test_curl_encodes_two_random_shifts():
         *((window.obs, shifted) for shifted in seen.values()),
     ):
         same = (one == other).flatten(2).float().mean(2)
-        assert (same < 0.05).float().mean() > 0.8, "few rows are shifted alike, or not at all"
-        assert (one.flatten(2).float().mean(2) - other.flatten(2).float().mean(2)).abs().max() < 2, "one observation"
+        assert (same < 0.05).float().mean() > 0.8, "most rows have different shifts"
+        assert (one.flatten(2).float().mean(2) - other.flatten(2).float().mean(2)).abs().max() < 2, "same observation"
 
 
 def test_curl_reaches_the_optimal_loss():
-    """Four distinct observations: the best loss is log(copies of the own one among the candidates)."""
+    """With four distinct observations the optimal loss is log(number of copies among the candidates)."""
     rows, batch = 1, 64
     g = torch.Generator().manual_seed(9)
     states = [finite_windows(batch, rows, 0.0, g)[1][:, 0] for _ in range(20)]
@@ -237,20 +237,20 @@ def test_curl_reaches_the_optimal_loss():
 
 
 def with_forward_model(kind: type, weight: float) -> torch.nn.Module:
-    """The same at every call but for the weight of the forward loss."""
+    """An objective with fixed initial weights and the given weight of the forward loss."""
     options = ACDFOptions(max_k=1, forward_weight=weight) if kind is ACDF else SMWMOptions(forward_weight=weight)
     return kind(encoder(), MSETarget(1, False), options, 0)
 
 
 @pytest.mark.parametrize("kind", [ACDF, SMWM])
 def test_latent_forward_models_learn_a_ring_without_collapse(kind: type):
-    """Without noise each action is told by two states, and each state by the one before and the action."""
+    """Without noise two states determine the action, and state and action the next state."""
     objective = with_forward_model(kind, 1.0)
     assert train(objective, 400, 0.0) < 0.02
     with torch.no_grad():
         states = objective.encoder.frame((torch.eye(STATES) * 255).to(torch.uint8)[:, :, None, None])
     apart = torch.cdist(states, states)[~torch.eye(STATES, dtype=torch.bool)]
-    assert apart.min() > 0.5, "a constant state would be foreseen best"
+    assert apart.min() > 0.5, "constant states would be easiest to predict"
 
 
 @pytest.mark.parametrize("kind", [ACDF, SMWM])

@@ -21,8 +21,8 @@ def test_sections_contain_all_goals(tmp_path, monkeypatch):
     assert all(value > 0 for value in measured.values())
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
     trained = {name for name, method in METHODS.items() if method.trained}
-    told_states = {"supervised", "supervised+a", "supervised_picture", "integrator"}
-    assert sections["methods"].keys() - {"k_30_over_k_15", "half_over_whole_resolution"} == trained - told_states
+    supervised = {"supervised", "supervised+a", "supervised_picture", "integrator"}
+    assert sections["methods"].keys() - {"k_30_over_k_15", "half_over_whole_resolution"} == trained - supervised
 
 
 def test_rendering_benchmark_spans_episodes(monkeypatch):
@@ -65,9 +65,9 @@ def test_benchmark_against_jax(tmp_path, monkeypatch):
     dataset, _ = suite.synthetic_set(tmp_path, 1)
     monkeypatch.setattr(suite, "apart", lambda *_: [{"ms": 1.0, "device": "cpu"}])
     monkeypatch.setattr(suite.importlib.util, "find_spec", lambda _: True)
-    told = suite.against_jax(dataset, 1, (16,))
+    results = suite.against_jax(dataset, 1, (16,))
     for ours in ("units_16_fp32", "units_16_bf16"):
-        assert told[f"{ours}_jax_over_ours"] == pytest.approx(1 / told[f"{ours}_ms"])
+        assert results[f"{ours}_jax_over_ours"] == pytest.approx(1 / results[f"{ours}_ms"])
     monkeypatch.setattr(suite.importlib.util, "find_spec", lambda _: None)
     assert "pip install" in suite.against_jax(dataset, 1)["jax"]
 
@@ -82,8 +82,8 @@ def test_benchmark_of_a_dataset_on_a_gpu(tmp_path, monkeypatch):
 
 def test_memory_benchmark_divides_by_frames(tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "run_jobs", lambda *_: [[300, 100]])
-    told = {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5, "second_process_over_frames": 0.5}
-    assert processes.memory(tmp_path, 200) == told
+    expected = {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5, "second_process_over_frames": 0.5}
+    assert processes.memory(tmp_path, 200) == expected
     monkeypatch.setattr(processes, "_STATUS", tmp_path / "none")
     assert processes.memory(tmp_path, 200) == {}
 

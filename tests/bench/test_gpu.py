@@ -11,7 +11,7 @@ from vd4rl_pomdp.runs.files import flatten
 
 @pytest.fixture
 def here(monkeypatch):
-    """Measures in this process what others would."""
+    """Run measurements in this process instead of subprocesses."""
 
     def apart(function, *arguments, count=1, **environment):
         module, _, name = function.rpartition(".")
@@ -24,13 +24,13 @@ def here(monkeypatch):
 
 def test_gpu_benchmark_runs_on_a_cpu(here, capsys):
     main(["bench", "--gpu", "--quick", "--device", "cpu", "--json"])
-    told = flatten(json.loads(capsys.readouterr().out))
-    assert [name for name in told if name.endswith("failed")] == []
-    assert told["device"] == "cpu"
+    results = flatten(json.loads(capsys.readouterr().out))
+    assert [name for name in results if name.endswith("failed")] == []
+    assert results["device"] == "cpu"
     measured = {name for name in gpu.AIMS if name != "td3_bc.jax_over_replayed"}
-    assert measured <= set(told)
-    assert all(told[name] > 0 for name in measured)
-    assert "jax" in told["td3_bc.jax"] or "no GPU" in told["td3_bc.jax"]
+    assert measured <= set(results)
+    assert all(results[name] > 0 for name in measured)
+    assert "jax" in results["td3_bc.jax"] or "no GPU" in results["td3_bc.jax"]
 
 
 def test_failed_measurement_does_not_stop_the_others(here, monkeypatch, capsys):

@@ -32,8 +32,8 @@ def test_jax_peer_matches_td3_bc_updates():
     ours = []
     for i, v in zip(index, view, strict=True):
         ends = [table["features"][v, table[end][v, i]].float() for end in ("first", "last")]
-        told = [table[name][i] for name in ("action", "reward", "discount")]
-        ours.append(algorithm.update(FeatureBatch(ends[0], *told, ends[1], told[0])))
+        taken = [table[name][i] for name in ("action", "reward", "discount")]
+        ours.append(algorithm.update(FeatureBatch(ends[0], *taken, ends[1], taken[0])))
     arrays = {name: jax_peer.as_jax(tensor) for name, tensor in table.items()}
     arrays |= {name: jax_peer.as_jax(getattr(policy.standardise, name)) for name in ("mean", "std")}
     draws = jax_peer.BatchDraws(*map(jax_peer.as_jax, (index, view, noise)))

@@ -1,4 +1,4 @@
-"""Every algorithm of the registry keeps the contract of algorithms, and what breaks it is caught."""
+"""All registered algorithms satisfy the contract of algorithms; violations are caught."""
 
 import copy
 
@@ -59,7 +59,7 @@ class Overwriting(TD3BC):
 
 
 class Half(BC):
-    """Trains its policy's last layer alone."""
+    """Trains only the last layer of its policy."""
 
     def __init__(self, policy, options, learning_rate, updates, generator):
         super().__init__(policy, options, learning_rate, updates, generator)
@@ -77,7 +77,7 @@ class Frozen(BC):
 
 
 class Twice(TD3BC):
-    """Its second loss reaches the representations, too."""
+    """Its second loss also has gradients to the representations."""
 
     def actor_loss(self, batch):
         value, logs = super().actor_loss(batch)
@@ -85,7 +85,7 @@ class Twice(TD3BC):
 
 
 class Jumping(TD3BC):
-    """Its targets move by another share than tau."""
+    """Moves its targets twice per update."""
 
     def move_targets(self):
         super().move_targets()
@@ -93,7 +93,7 @@ class Jumping(TD3BC):
 
 
 class Forgetful(TD3BC):
-    """Its state lacks the number of updates, which decides when the actor learns."""
+    """Does not restore the number of updates, which determines when the actor is updated."""
 
     def load_state_dict(self, state):
         super().load_state_dict(state | {"updates": 0})
@@ -105,21 +105,21 @@ class Drawing(BC):
 
 
 class Late(BC):
-    """Draws within its loss, where a stack has one run's batch and the streams of all."""
+    """Draws within its loss, where a stack has one run's batch but the streams of all runs."""
 
     def cloning_loss(self, batch, noise):
         return super().cloning_loss(batch, self.draws.normal(*batch.action.shape))
 
 
 class Reading(BC):
-    """Decides by a value, which a stack has several of."""
+    """Has control flow that depends on values, which differ between stacked runs."""
 
     def cloning_loss(self, batch, noise):
         return super().cloning_loss(batch, noise if batch.reward.sum() > 0 else -noise)
 
 
 class Mixing(BC):
-    """Computes from the whole batch outside of any loss: of stacked runs, from those of all."""
+    """Computes a batch mean outside of its losses, which mixes stacked runs."""
 
     def update(self, batch, *encoder):
         return super().update(batch.replace(action=batch.action - batch.action.mean()), *encoder)

@@ -1,4 +1,4 @@
-"""Every corruption of the benchmark keeps the contract of corruptions, and what breaks it is caught."""
+"""All corruptions satisfy the contract of corruptions; violations are caught."""
 
 from dataclasses import dataclass
 
@@ -52,7 +52,7 @@ def test_frame_drops_conform_with_options(name, options):
 
 @dataclass(frozen=True)
 class Alternating(FrameDrop):
-    """One frame of its own choice: even keys lose the newest."""
+    """Drops one frame: the newest for even keys, the oldest for odd ones."""
 
     def dropped(self, stack):
         return 1
@@ -77,7 +77,7 @@ class Nothing(Options):
 
 @dataclass(frozen=True)
 class Batchwise(Options):
-    """Draws one place for the whole batch."""
+    """Draws one position for the whole batch."""
 
     def __call__(self, frames, key, number):
         frames[..., int(key.sum() % 80) :, :] = 0
@@ -91,7 +91,7 @@ class Drawing(Options):
 
 @dataclass(frozen=True)
 class Counting(Options):
-    """Looks otherwise at every call."""
+    """Hides another column in every call."""
 
     def __call__(self, frames, key, number):
         CALLS.append(1)
@@ -111,7 +111,7 @@ class Elsewhere(Patch):
 
 @dataclass(frozen=True)
 class Inheriting(Patch):
-    """What `Patch` tells of pixels is not true of it."""
+    """Overrides `__call__`, so the inherited description of hidden pixels is wrong."""
 
     def __call__(self, frames, key, number):
         frames[..., 0, :] = 0
@@ -125,7 +125,7 @@ class Failing(Options):
 
 @dataclass(frozen=True)
 class Wavering(Alternating):
-    """Drops another frame at every call."""
+    """Drops another frame in every call."""
 
     def order(self, key, stack):
         CALLS.append(1)

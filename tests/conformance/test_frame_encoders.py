@@ -1,4 +1,4 @@
-"""Every frame encoder of the registry keeps the contract of frame encoders, and what breaks it is caught."""
+"""All registered frame encoders satisfy the contract of frame encoders; violations are caught."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ from vd4rl_pomdp.testing.frame_encoders import (
 )
 
 SIZE = 20
-"""Which all of them read, but for those with large kernels."""
+"""Image size that all encoders with small kernels can read."""
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
@@ -37,7 +37,7 @@ def convolution(channels: int, size: int, options: object) -> nn.Sequential:
 
 
 def with_layer(make: Callable[[], nn.Module]) -> Callable[..., nn.Sequential]:
-    """A frame encoder with one layer more."""
+    """A frame encoder with an additional layer."""
     return lambda channels, size, options: nn.Sequential(convolution(channels, size, options), make())
 
 
@@ -47,7 +47,7 @@ class Flat(nn.Module):
 
 
 class Bounded(nn.Module):
-    """Lets no picture through that is unlike the zeros that the shape is found with."""
+    """Its features are not finite."""
 
     def forward(self, x):
         return x / (x * 0)
@@ -63,7 +63,7 @@ class Lost(nn.Module):
 
 
 class Hidden(nn.Module):
-    """Its weights are in no state."""
+    """Its weight is not part of its state."""
 
     def __init__(self):
         super().__init__()
@@ -74,7 +74,7 @@ class Hidden(nn.Module):
 
 
 class Backbone(nn.Conv2d):
-    """Weights that were trained elsewhere and stay as they are."""
+    """Frozen pretrained weights."""
 
     def __init__(self):
         super().__init__(4, 4, 1)
@@ -121,7 +121,7 @@ def test_check_frame_encoder_accepts_conforming_encoders(encoders):
 
 
 class Twice(nn.Module):
-    """A convolution that is used twice, under two names."""
+    """A convolution used twice under two names."""
 
     def __init__(self):
         super().__init__()
@@ -132,7 +132,7 @@ class Twice(nn.Module):
 
 
 class OverFrames(nn.Module):
-    """A convolution over places and frames."""
+    """A convolution over positions and frames."""
 
     def __init__(self):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Every memory keeps the contract of memories, another one finds its way in, and what breaks it is caught."""
+"""All memories satisfy the contract of memories; violations are caught."""
 
 import pytest
 import torch
@@ -69,20 +69,20 @@ class Averaged(GRU):
 
 
 class Short(GRU):
-    """Sees more than it says."""
+    """Sees more rows than it declares."""
 
     reach = 2
 
 
 class Forgetful(GRU):
-    """Begins anew with every call."""
+    """Resets its state in every call."""
 
     def forward(self, rows, state):
         return super().forward(rows, torch.zeros_like(state))
 
 
 class Peeking(GRU):
-    """Says that it reads the first observation alone, and reads all."""
+    """Declares to read only the first observation, but reads all."""
 
     first_only = True
 
@@ -100,7 +100,7 @@ class Unused(GRU):
 
 
 class Hidden(GRU):
-    """A weight that is in no state."""
+    """Has a weight that is not part of its state."""
 
     scale = 1.0
 

@@ -1,4 +1,4 @@
-"""Every method of the registry keeps the contract of methods, and what breaks it is caught."""
+"""All registered methods satisfy the contract of methods; violations are caught."""
 
 from collections.abc import Callable
 
@@ -34,13 +34,13 @@ def test_method_conforms(name: str, check: Callable):
 
 
 def test_inverse_loss_is_the_action_loss():
-    """`check_method` proves what weighted terms add to it."""
+    """`check_method` tests the weighted terms."""
     loss, logs = build("mik+a").loss(batch(), 0.0)
     assert torch.equal(loss.detach(), logs["action_loss"])
 
 
 def test_self_prediction_has_no_gradient_to_its_target():
-    """||sg(s_{t+k}) - g(s_t, k)||^2: a window's last state is nothing but a target, so no gradient may reach it."""
+    """||sg(s_{t+k}) - g(s_t, k)||^2: a window's last state is only a target and must receive no gradient."""
     objective, window = build("mik+a", self_prediction=1.0), batch((ROWS, ROWS))
     past, future = (x.detach().requires_grad_() for x in objective.representations(window))
     loss, logs = objective.loss_of(past, future, window, 0.0)
@@ -55,7 +55,7 @@ def test_self_prediction_has_no_gradient_to_its_target():
 
 
 class Mean(Objective):
-    """Pulls the mean of the features to 1; right, but for what its subclasses break."""
+    """A valid method that pulls the mean of the features to 1; subclasses break the contract."""
 
     def __init__(self, encoder, target, options, seed):
         super().__init__()
@@ -93,7 +93,7 @@ class Frozen(Mean):
 
 
 class Still(Mean):
-    """Its gradient leads nowhere that its value tells of."""
+    """Its gradient is unrelated to its value."""
 
     def loss(self, window, progress):
         loss = super().loss(window, progress)[0]
@@ -102,7 +102,7 @@ class Still(Mean):
 
 
 class Counting(Mean):
-    """Its loss depends on a number that no state holds."""
+    """Its loss depends on a counter that is not part of the state."""
 
     def loss(self, window, progress):
         self.steps += 1
@@ -111,7 +111,7 @@ class Counting(Mean):
 
 
 class Drawing(Mean):
-    """Draws from torch's own generator while it trains."""
+    """Draws from torch's global generator."""
 
     def loss(self, window, progress):
         loss = super().loss(window, progress)[0] * torch.rand(())
@@ -125,7 +125,7 @@ class Unmasked(Mean):
 
 
 class Looking(Mean):
-    """Its encoder sees a window's last row in every row, which a stream cannot."""
+    """Its encoder sees the window's last row in every row, which streaming cannot reproduce."""
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
@@ -134,7 +134,7 @@ class Looking(Mean):
 
 
 class DrawingInverse(StateInverse):
-    """Predicts from noisy states, by draws that move on with every call."""
+    """Predicts from noisy states with fresh draws in every call."""
 
     def __init__(self, encoder, target, options, seed):
         super().__init__(encoder, target, options, seed)

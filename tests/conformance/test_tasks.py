@@ -1,4 +1,4 @@
-"""Every task of the benchmark keeps the contract of tasks, and what breaks it is caught."""
+"""All tasks satisfy the contract of tasks; violations are caught."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def test_task_conforms(name, check):
 
 
 class Square(gymnasium.Env):
-    """Shows and pays a number that its seed decides; right, but for what its subclasses break."""
+    """A valid environment that shows and returns a number drawn from its seed; subclasses break the contract."""
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
@@ -68,7 +68,7 @@ class Failing(Square):
 
 
 class Strict(Square):
-    """Takes what is within its bounds, which are no sums of powers of two, and in their dtype."""
+    """Rejects actions outside its bounds, which are not exact in binary, or of another dtype."""
 
     def __init__(self, render_mode=None):
         super().__init__(render_mode)
@@ -144,7 +144,7 @@ def test_harness_defects_are_caught(tasks, monkeypatch):
 
 def test_check_task_accepts_conforming_tasks(tasks):
     tasks.register("strict", GymnasiumTask(Strict, decisions=5))
-    tasks.register("reacher", DMCTask("reacher", "easy"))  # it draws a target, and cannot be replayed
+    tasks.register("reacher", DMCTask("reacher", "easy"))  # draws a random target, so it cannot be replayed
     check_task("strict")
     check_task("reacher")
     with pytest.raises(UserError, match="unknown task 'mine'"):

@@ -1,8 +1,7 @@
-"""Objectives that see more, or less, than they declare are caught.
+"""Objectives that see more or less than they declare are caught by gradients and by changed inputs.
 
-By gradients, and by changing one input at a time. The objectives of this project are held against the paper's sets in
-`test_visible_sets.py`, and against what they declare in `test_methods.py`, in training mode, too; that frame encoders
-mix no pictures is in `test_frame_encoders.py`.
+`test_visible_sets.py` compares this project's objectives with the paper's sets, `test_methods.py` with their
+declarations, and `test_frame_encoders.py` checks that frame encoders do not mix images.
 """
 
 from collections.abc import Callable
@@ -41,7 +40,7 @@ def test_integrator_sees_one_observation_and_later_actions(method, options):
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_extra_frame_in_the_future_is_caught(row: int):
-    """The rows that are seen stay the same: only the count of frames tells."""
+    """The visible rows stay equal; only the visible frames differ."""
     objective = inverse("mik+a", future_frames="newest")
     blanked = objective._blanked
     objective._blanked = lambda obs: [obs if row == i else blank for i, blank in enumerate(blanked(obs))]
@@ -50,7 +49,7 @@ def test_extra_frame_in_the_future_is_caught(row: int):
 
 
 def shift_states(objective: InverseObjective, which: tuple[int, ...]) -> None:
-    """Make the past (0) or future (1) representation of row t that of row t - 1."""
+    """Shift the past (0) or future (1) representations by one row."""
     real = objective.representations
     objective.representations = lambda w: tuple(r.roll(1, 1) if i in which else r for i, r in enumerate(real(w)))
 

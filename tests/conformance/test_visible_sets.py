@@ -1,12 +1,12 @@
-"""What predictions depend on, against sets written from the paper's Table 1, not from the code.
+"""The inputs of predictions, compared with sets written from the paper's Table 1 and not from the code.
 
-Twice: drawn by hand for single pairs, and as formulas for all pairs of all windows. What a prediction
-depends on is found by changing one input at a time, and by gradients; `visible`, which reads the code's own settings,
-must say the same. Of `mik+a` they are the table's in the reading that this project chose: its later view begins with
-o_{t+k} and the action taken there, not with the one before, which the option `literal_future` restores.
+The sets are drawn by hand for single pairs, and given as formulas for all pairs of all windows. The inputs are found
+by changing one of them at a time and by gradients, and must also equal the declaration `visible`. For `mik+a` the sets
+follow this project's reading of the table: the future begins with o_{t+k} and the action taken there; the option
+`literal_future` begins with the action before instead.
 
-The table's observations are stacks of three frames here, so each of them shows the two frames before it, those of
-masked steps among them: all pairs are counted in frames, too.
+Observations are stacks of three frames, so each shows the two frames before it, including those of masked steps.
+Therefore all pairs are also compared in frames.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from vd4rl_pomdp.testing.methods import ROWS, build_inverse, predicts_actions
 
 INSIDE, END, SHORT = 0, 1, 2
 LENGTHS = [ROWS, ROWS, 4]
-"""A window that ends inside its episode, whose last row has an action; one that ends with it; one with padding."""
+"""Windows that end inside the episode (their last row has an action), with the episode, and with padding."""
 OPTIONS: dict[str, dict] = {
     "gru": {"history": "gru"},
     "layers": {"gru_layers": 2},
@@ -85,13 +85,13 @@ ah+a              narrow         inside  1 3     ##.##.    #.##..
 ah+a              narrow         inside  2 3     .##.##    ##.##.
 acro              narrow         inside  3 1     ..###.    ......
 """
-"""By hand: # is seen, . is not. Columns: rows j of o_j and indices j of a_j; a_5 exists if the window ends inside."""
+"""# is visible, . is not. Columns: j of o_j and of a_j; a_5 exists only if the window ends inside the episode."""
 Case = tuple[str, tuple[str, ...]]
 LINES = [line.split() for line in DRAWN.strip().splitlines()[2:] if line]
 
 
 def test_only_fj_has_a_bounded_past_by_default():
-    """The windows below are too short to show it."""
+    """The windows below are too short for the default of m = 8."""
     bounded = {name: method.past for name, method in METHODS.items() if method.past is not None}
     assert bounded == {"fj": JUMPS_PAST, "fj+a": JUMPS_PAST}
 
@@ -106,7 +106,7 @@ def settings(words: tuple[str, ...]) -> dict:
 
 @cache
 def seen_by(method: str, words: tuple[str, ...], frames: bool = False) -> tuple[InverseObjective, dict, dict]:
-    """An objective, and what its predictions change with and have gradients to, pair by pair of every window."""
+    """An objective, and by (window, t, k) the inputs that change its prediction and those with gradients."""
     largest = {} if method in ("one_step_inverse", "smwm") else {"max_k": ROWS - 1}
     objective = build_inverse(method, **largest, **settings(words)).eval()
     return objective, response(objective, LENGTHS, frames=frames), dependence(objective, LENGTHS, frames=frames)
@@ -115,11 +115,11 @@ def seen_by(method: str, words: tuple[str, ...], frames: bool = False) -> tuple[
 @pytest.mark.parametrize("line", LINES, ids=" ".join)
 def test_predictions_depend_on_drawn_sets(line: list[str]):
     method, options, window, t, k, rows, actions = line
-    objective, felt, followed = seen_by(method, words_of(options))
+    objective, changing, differentiable = seen_by(method, words_of(options))
     place = WINDOWS[window], int(t), int(k)
     drawn = marked(rows), marked(actions)
-    assert felt[place] == drawn
-    assert followed[place] == drawn
+    assert changing[place] == drawn
+    assert differentiable[place] == drawn
     assert declared(objective, *place[1:], LENGTHS[place[0]], last_action=place[0] == INSIDE) == drawn
 
 
@@ -132,11 +132,11 @@ def marked(drawing: str) -> set[int]:
 
 
 FAR = 99
-"""m or n of a past or future without a bound."""
+"""m or n of an unbounded past or future."""
 JUMPS_PAST = 8
-"""m of FJ and FJ+A unless another is asked for: the paper names none, docs/navigation.md says 8."""
+"""Default m of FJ and FJ+A: the paper gives none, docs/navigation.md documents 8."""
 Seen = Callable[[int, int, int, int, int], bool]
-"""(j, t, u = t+k, m, n) -> whether row or action j is seen."""
+"""(j, t, u = t+k, m, n) -> whether row or action j is visible."""
 ROW_OF: dict[str, Seen] = {
     "no_history": lambda j, t, u, m, n: j in (t, u),
     "acro": lambda j, t, u, m, n: j in (t, u),
@@ -147,15 +147,14 @@ ROW_OF: dict[str, Seen] = {
     "fj": lambda j, t, u, m, n: t - m <= j <= t or u - m <= j <= u,
     "mik": lambda j, t, u, m, n: t - m <= j <= t or u <= j <= u + n,
 }
-"""Rows j of o_j in the paper's Table 1, or a memoryless method's own; m rows of the past, n of the future."""
+"""Visible o_j in the paper's Table 1, or of a memoryless method; m rows of the past, n of the future."""
 ACTION_OF: dict[str, Seen] = {
     "ah+a": lambda j, t, u, m, n: t - m <= j < t or u - m <= j < u,
     "fj+a": lambda j, t, u, m, n: t - m <= j < t or u - m <= j < u,
     "mik+a": lambda j, t, u, m, n: t - m <= j < t or u <= j <= u + n,
     "mik+a literal": lambda j, t, u, m, n: t - m <= j < t or u <= j + 1 <= u + n,
 }
-"""Indices j of a_j, likewise; methods that are not named see none. Read literally, each row of the future comes with
-the action before it."""
+"""Visible a_j; methods without an entry see none. In the literal reading each future row has the action before it."""
 BOUNDED = [
     *((name, ()) for name in METHODS if predicts_actions(name)),
     *((name, (m,)) for name in ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a") for m in ("m=0", "m=1", "m=2")),
@@ -179,12 +178,12 @@ BOUNDED = [
 
 
 def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: int, acts: int) -> tuple:
-    """Table 1's sets: rows up to `last`, actions up to `acts`. A memoryless method with a memory sees what AH does."""
-    told = settings(words)
-    m, n = told.get("m", JUMPS_PAST if method in ("fj", "fj+a") else FAR), told.get("n", FAR)
-    table = "ah" if "history" in told and METHODS[method].history == "none" else method.removesuffix("+a")
+    """Table 1's sets: rows up to `last`, actions up to `acts`. A memoryless method given a memory sees AH's rows."""
+    given = settings(words)
+    m, n = given.get("m", JUMPS_PAST if method in ("fj", "fj+a") else FAR), given.get("n", FAR)
+    table = "ah" if "history" in given and METHODS[method].history == "none" else method.removesuffix("+a")
     row = ROW_OF[table]
-    action = ACTION_OF.get(method + " literal" * told.get("literal_future", False), lambda *_: False)
+    action = ACTION_OF.get(method + " literal" * given.get("literal_future", False), lambda *_: False)
     return (
         {j for j in range(last + 1) if row(j, t, t + k, m, n)},
         {j for j in range(acts + 1) if action(j, t, t + k, m, n)},
@@ -196,23 +195,23 @@ def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: in
     ("method", "words"), BOUNDED, ids=lambda value: value if isinstance(value, str) else ",".join(value)
 )
 def test_visible_sets_match_the_papers_table(method: str, words: tuple[str, ...], frames: bool):
-    """Rows; or frames, of which each row shows its own and the two before it: masked ones, too, unless blanked."""
-    objective, felt, followed = seen_by(method, words, frames)
-    assert len(felt) == sum(len(objective.pairs(length)) for length in LENGTHS)
-    for (window, t, k), seen in felt.items():
+    """In frames each row shows its own and the two before it, including masked ones unless they are blanked."""
+    objective, changing, differentiable = seen_by(method, words, frames)
+    assert len(changing) == sum(len(objective.pairs(length)) for length in LENGTHS)
+    for (window, t, k), seen in changing.items():
         last = LENGTHS[window] - 1
         acts = last if window == INSIDE and "literal" not in words else last - 1
         table = rows, actions = from_the_paper(method, words, t, k, last, acts)
         if frames:
             masked = set(range(t + 1, t + k)) if "newest" in words else set()
             table = {frame for row in rows for frame in (row - 2, row - 1, row)} - masked, actions
-        assert seen == followed[window, t, k] == table, (window, t, k)
+        assert seen == differentiable[window, t, k] == table, (window, t, k)
         assert declared(objective, t, k, LENGTHS[window], window == INSIDE, frames) == table, (window, t, k)
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if predicts_actions(name)])
 def test_target_leaks_match_the_papers_table(method: str):
-    """a_t itself: AH+A always, FJ+A up to m, the literal MIK+A at k = 1, and nobody else."""
+    """AH+A always sees a_t, FJ+A up to k = m, the literal MIK+A at k = 1, and no other method does."""
     for words in ((), ("literal",)) if method == "mik+a" else (("m=2",),) if method.startswith("fj") else ((),):
         leaks = {k for (_, t, k), (_, actions) in seen_by(method, words)[1].items() if t in actions}
         expected = {("ah+a", ()): {1, 2, 3, 4, 5}, ("fj+a", ("m=2",)): {1, 2}, ("mik+a", ("literal",)): {1}}

@@ -1,4 +1,4 @@
-"""What representations depend on, and what predictions depend on in a set: closed forms against changed inputs."""
+"""Inputs of representations, and stored rows behind predictions: closed forms against changed inputs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,13 +25,13 @@ MEMORIES: list[tuple[str, dict]] = [
     *((name, {"history": memory}) for name in ("acro", "fj+a", "mik+a") for memory in ("transformer", "lru")),
     *((name, {"m": m}) for name in ("ah+a", "fj", "fj+a", "mik", "mik+a", "supervised+a") for m in (0, 2)),
 ]
-"""Every method that reads pixels, the memoryless ones with a GRU, too, other memories, and bounded pasts."""
+"""All methods that read pixels, memoryless ones also with a GRU, other memories, and bounded pasts."""
 ALL = 99
-"""m of a past without a bound."""
+"""m of an unbounded past."""
 
 
 def states_of(encoder: Encoder, obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(T, D) representations of one window of rows o_j and actions a_j: of the whole, and row by row."""
+    """(T, D) representations of a window of o_j and a_j, computed at once and row by row."""
     before = torch.cat([torch.zeros_like(actions[:1]), actions[:-1]])
     whole = encoder.from_features(encoder.frame(obs[None]), before[None])[0]
     state, rows = encoder.initial_state(1), []
@@ -43,7 +43,7 @@ def states_of(encoder: Encoder, obs: torch.Tensor, actions: torch.Tensor) -> tup
 
 @torch.no_grad()
 def read_by(encoder: Encoder) -> list[tuple[set[int], set[int]]]:
-    """For each row, the observations and actions that its representation changes with, by either way of reading."""
+    """For each row, the observations and actions that change its representation, at once and streamed."""
     shape, g = encoder.config, torch.Generator().manual_seed(0)
     obs = torch.rand(2, ROWS, shape.channels, shape.size, shape.size, generator=g, dtype=torch.float64) * 255
     actions = torch.rand(2, ROWS, shape.action_dim, generator=g, dtype=torch.float64) - 0.5
@@ -55,29 +55,29 @@ def read_by(encoder: Encoder) -> list[tuple[set[int], set[int]]]:
             inputs = [obs[0].clone(), actions[0].clone()]
             inputs[kind][j] = (obs, actions)[kind][1, j]
             both = [(new != old).any(-1) for new, old in zip(states_of(encoder, *inputs), plain, strict=True)]
-            assert torch.equal(*both), "a stream depends on other rows than a window"
+            assert torch.equal(*both), "streaming depends on other rows"
             for t in torch.nonzero(both[0])[:, 0].tolist():
                 touched[t].add(j)
         found.append(touched)
     return list(zip(*found, strict=True))
 
 
-def past(t: int, method: str, told: dict) -> tuple[set[int], set[int]]:
-    """What s_t is computed from: o_t, or the last m+1 rows, with the actions between them if past actions are read."""
+def past(t: int, method: str, settings: dict) -> tuple[set[int], set[int]]:
+    """Inputs of s_t: o_t, or the last m+1 rows, with the actions between them if the method reads actions."""
     if method == "integrator":
         return {0}, set(range(t))
-    remembers = method.removesuffix("+a") in ("ah", "fj", "mik", "supervised") or "history" in told
+    remembers = method.removesuffix("+a") in ("ah", "fj", "mik", "supervised") or "history" in settings
     if not remembers:
         return {t}, set()
-    m = told.get("m", 8 if method.startswith("fj") else ALL)
+    m = settings.get("m", 8 if method.startswith("fj") else ALL)
     rows = {j for j in range(ROWS) if t - m <= j <= t}
     return rows, {j for j in rows if j < t and method.endswith("+a")}
 
 
-@pytest.mark.parametrize(("method", "told"), MEMORIES, ids=str)
-def test_representations_depend_only_on_their_past(method: str, told: dict):
-    encoder = build_inverse(method, **told).encoder.eval()
-    assert read_by(encoder) == [past(t, method, told) for t in range(ROWS)]
+@pytest.mark.parametrize(("method", "settings"), MEMORIES, ids=str)
+def test_representations_depend_only_on_their_past(method: str, settings: dict):
+    encoder = build_inverse(method, **settings).encoder.eval()
+    assert read_by(encoder) == [past(t, method, settings) for t in range(ROWS)]
 
 
 @pytest.mark.parametrize("method", ["mik+a", "fj", "supervised", "acro"])
@@ -93,7 +93,7 @@ def test_readouts_depend_on_frame_or_state(method: str):
 
 
 EPISODES, SPAN = (7, 6), 4
-"""Rows of a set's episodes, and of the windows that are drawn from it."""
+"""Rows of the dataset's episodes, and of windows."""
 STORED = {
     "mik+a": lambda j, t, u, first: (first <= j <= t or u <= j, first <= j < t or u <= j),
     "ah+a": lambda j, t, u, first: (first <= j <= u, first <= j < u),
@@ -103,7 +103,7 @@ STORED = {
     ),
     "acro": lambda j, t, u, first: (j in (t, u), False),
 }
-"""Whether o_j and a_j of an episode are seen through a window that begins at its row `first`, at m = 1 for FJ+A."""
+"""Whether a window that begins at row `first` shows o_j and a_j of the episode; m = 1 for FJ+A."""
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def dataset(tmp_path) -> Dataset:
 
 
 def changed_rows(dataset: Dataset, name: str, stored: torch.Tensor, logits: Callable[[], torch.Tensor]) -> list:
-    """For each row of the set, the (B, P) predictions that differ when what the set stores in it is another."""
+    """For each row of the dataset, the (B, P) predictions that differ after a change of its stored value."""
     plain, found = logits(), []
     for row in range(dataset.num_rows):
         other = stored.clone()
@@ -127,7 +127,7 @@ def changed_rows(dataset: Dataset, name: str, stored: torch.Tensor, logits: Call
 
 
 def on_frames(dataset: Dataset, method: str, stack: int) -> InverseObjective:
-    """A small objective in float64 that reads stacks of a set's frames."""
+    """A small float64 objective on stacks of the dataset's frames."""
     torch.manual_seed(0)
     changes = {"max_k": SPAN - 1, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
     changes |= {"m": 1} if method == "fj+a" else {}
@@ -142,7 +142,7 @@ def on_frames(dataset: Dataset, method: str, stack: int) -> InverseObjective:
 @pytest.mark.parametrize("method", STORED)
 @torch.no_grad()
 def test_predictions_depend_only_on_their_episodes_rows(dataset: Dataset, method: str, stack: int):
-    """Frames of the stacks that are seen, which may begin before the window, and a_j, which row j+1 stores."""
+    """Frames of visible stacks, which may begin before the window, and a_j, which row j+1 stores."""
     objective = on_frames(dataset, method, stack)
     starts = [(e, first) for e, rows in enumerate(EPISODES) for first in range(rows - SPAN + 1)]
 
@@ -154,9 +154,9 @@ def test_predictions_depend_only_on_their_episodes_rows(dataset: Dataset, method
     for b, (episode, first) in enumerate(starts):
         begin, rows = sum(EPISODES[:episode]), EPISODES[episode]
         for p, (t, k) in enumerate(objective.pairs(SPAN).tolist()):
-            told = [STORED[method](j, first + t, first + t + k, first) for j in range(first + SPAN)]
-            frames = {begin + max(0, j - back) for j, (row, _) in enumerate(told) if row for back in range(stack)}
-            actions = {begin + j + 1 for j, (_, action) in enumerate(told) if action and j + 1 < rows}
+            seen = [STORED[method](j, first + t, first + t + k, first) for j in range(first + SPAN)]
+            frames = {begin + max(0, j - back) for j, (row, _) in enumerate(seen) if row for back in range(stack)}
+            actions = {begin + j + 1 for j, (_, action) in enumerate(seen) if action and j + 1 < rows}
             assert {row for row, touched in enumerate(by_frame) if touched[b, p]} == frames
             assert {row for row, touched in enumerate(by_action) if touched[b, p]} == actions
 
@@ -172,10 +172,10 @@ GIVEN = {
     ("last end", "state", 2): (range(11, 13), range(12, 13)),
     ("last end", "frame+state", 0): (range(8, 13), range(9, 13)),
 }
-"""By hand: rows of the set whose frames, and whose stored actions, a policy of mik+a is given at row 10, or at 12.
+"""Rows whose frames and stored actions are inputs of a mik+a policy at row 10, or at 12 for the last end.
 
-The second episode is rows 7 to 12. Its whole history begins at row 7, the random one of both ends at row 8; a history's
-first row shows its frame alone.
+The second episode is rows 7 to 12. Its whole history begins at row 7, the random one of both ends at row 8. The first
+row of a history contributes only its frame.
 """
 
 

@@ -1,4 +1,4 @@
-"""The list of mutants and the code stay together; `python tools/mutants.py` tries them."""
+"""The list of mutants matches the code; `python tools/mutants.py` runs them."""
 
 import ast
 import importlib

@@ -1,4 +1,4 @@
-"""Certificates: what they rest on, what they say, and where they are read."""
+"""Certificates: training, verdicts, and where they are shown."""
 
 import json
 from html import unescape
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 
 @pytest.fixture
 def states(tmp_path):
-    """A set of ten short episodes with states."""
+    """A dataset of ten short episodes with states."""
     rows = fake_rows([9] * 10, physics_dim=18)
     rows["physics"] = np.random.default_rng(0).normal(size=(90, 18))
     folder = tmp_path / "walker_walk" / "expert"
@@ -30,7 +30,7 @@ def states(tmp_path):
 
 @pytest.fixture
 def carried(monkeypatch):
-    """Words of the commands that sweeps carry out, here in this process."""
+    """Command lines of sweep jobs, which run in this process."""
     done = []
 
     def carry_out(plans, *_):
@@ -55,38 +55,38 @@ def test_certificate_is_computed_stored_and_shown(states, carried, tmp_path, mon
     trained = [f"{method}/seed0/pretrain" for method in (MEMORY, *FLOORS)]
     assert [line[-1].removeprefix(f"{out}/") for line in carried] == trained
     assert all("--hold-out" in line and "24" in line for line in carried)
-    (told,) = json.loads((out / "certificates.json").read_text()).values()
-    assert told["name"] == "patch, patch_size 24"
-    assert told["why"].startswith("R2: supervised+a -")
-    assert told["why"].endswith(", too few seeds, itself too low to judge; 1 steps, no returns")
+    (certificate,) = json.loads((out / "certificates.json").read_text()).values()
+    assert certificate["name"] == "patch, patch_size 24"
+    assert certificate["why"].startswith("R2: supervised+a -")
+    assert certificate["why"].endswith(", too few seeds, itself too low to judge; 1 steps, no returns")
     assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
-    assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
+    assert f"patch: {certificate['verdict']} ({certificate['why']})" in capsys.readouterr().out
     (states / "certificates.json").unlink()
-    (states / "certificates.json").mkdir()  # nor can it be written to a dataset that is read-only
+    (states / "certificates.json").mkdir()  # a file that cannot be written, as in a read-only dataset
     main(words)
     shown = capsys.readouterr()
-    assert f"patch: {told['verdict']} ({told['why']})" in shown.out
+    assert f"patch: {certificate['verdict']} ({certificate['why']})" in shown.out
     assert f"the certificate is only in {out}" in shown.err
     (states / "certificates.json").rmdir()
 
     before, carried[:] = contents(out / MEMORY), []
     main([*words, *POLICIES.split(), "--returns"])
-    assert [line[0] for line in carried].count("pretrain") == 1, "of the state alone"
+    assert [line[0] for line in carried].count("pretrain") == 1, "only the state reference"
     assert [line[0] for line in carried].count("finetune") == 4
     kept = contents(out / MEMORY)
-    assert {name: kept[name] for name in before} == before, "what is there is not trained again"
-    (told,) = json.loads((out / "certificates.json").read_text()).values()
-    assert "returns: state returns " in told["why"]
-    assert "critics are not known to have converged" in told["why"]
-    assert told["measured"]["returns"]["verdict"] == OPEN
-    assert told["why"].endswith("; 1 steps, 5 updates")
-    main([*words[:4], str(tmp_path / "again"), *words[5:]])  # of a smaller budget, without policies
-    assert json.loads((states / "certificates.json").read_text()).popitem()[1] == told
+    assert {name: kept[name] for name in before} == before, "finished runs are not trained again"
+    (certificate,) = json.loads((out / "certificates.json").read_text()).values()
+    assert "returns: state returns " in certificate["why"]
+    assert "critics are not known to have converged" in certificate["why"]
+    assert certificate["measured"]["returns"]["verdict"] == OPEN
+    assert certificate["why"].endswith("; 1 steps, 5 updates")
+    main([*words[:4], str(tmp_path / "again"), *words[5:]])  # smaller budget, without policies
+    assert json.loads((states / "certificates.json").read_text()).popitem()[1] == certificate
 
     main(["data", "card", str(states)])
-    assert f"| memory under patch, patch_size 24 | {told['verdict']} (" in (states / "card.md").read_text()
+    assert f"| memory under patch, patch_size 24 | {certificate['verdict']} (" in (states / "card.md").read_text()
     without_figures(monkeypatch)
-    line = f"memory: {told['verdict']} ({told['why']})"
+    line = f"memory: {certificate['verdict']} ({certificate['why']})"
     (states / "certificates.json").unlink()
     main(["results", "add", str(out), "--out", str(tmp_path / "kept")])
     for source, target in ((out, "first"), (tmp_path / "kept", "second"), (tmp_path / "first", "third")):
@@ -112,10 +112,10 @@ def test_missing_certificate_is_reported(tmp_path, monkeypatch, capsys):
     main(report)
     assert "memory: not certified\n" in capsys.readouterr().out
     assert not (tmp_path / "report" / "certificates.json").exists()
-    for year in ("2027", "2026"):  # of two with one budget the newest counts
+    for year in ("2027", "2026"):  # the newest of equal budget counts
         (tmp_path / "runs" / year).mkdir()
-        told = certificate | {"made": year, "why": f"in {year}"}
-        keep_certificates(tmp_path / "runs" / year, {certificate_id("f00", hidden): told})
+        dated = certificate | {"made": year, "why": f"in {year}"}
+        keep_certificates(tmp_path / "runs" / year, {certificate_id("f00", hidden): dated})
     main(report)
     assert f"memory: {NEEDS} (in 2027)\n" in capsys.readouterr().out
 
@@ -133,9 +133,9 @@ def test_verdict_follows_from_both_intervals():
     assert verdict(0.0, 0.4) == NEEDS_NOT, "one observation is as good"
     assert verdict(0.4, 0.03) == NEEDS_NOT, "less than the margin"
     assert verdict(0.4, -0.3) == NEEDS_NOT
-    assert verdict(0.4, 0.0, level=0.45) == OPEN, "it knows little itself: for want of budget?"
+    assert verdict(0.4, 0.0, level=0.45) == OPEN, "the memory is too poor to judge, perhaps for lack of budget"
     assert verdict(0.4, 0.3, level=0.45) == NEEDS
-    assert verdict(0.4, 0.3, level=-0.1) == OPEN, "worse than the mean, but above overfitted probes of noise"
+    assert verdict(0.4, 0.3, level=-0.1) == OPEN, "worse than predicting the mean"
     assert verdict(0.4, 0.1, spread=1) == OPEN
     assert verdict(0.4, 0.3, seeds=1) == OPEN
 

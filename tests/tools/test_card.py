@@ -1,4 +1,4 @@
-"""What goes to a machine without a network, and what comes home from it."""
+"""Packing runs for a machine without a network, running them there, and the returned results."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ from vd4rl_pomdp.sweeps.stages import check_cells
 ROOT = Path(__file__).parents[2]
 CARD = ROOT / "tools" / "card"
 NOT_CARRIED = {"torch", "numpy", "pandas", "wandb", "huggingface-hub"}
-"""What the machine has, and what trainings there do not import."""
+"""Packages that the machine provides or that trainings do not import."""
 STUB = """
 import json, os, signal, sys, time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The ladder of budgets: what it keeps of its runs, the cloning loss of their policies, and the rule for a budget."""
+"""The ladder of budgets: kept policies, their cloning losses, and the rule for a budget."""
 
 import csv
 import importlib
@@ -29,7 +29,7 @@ def scripts(monkeypatch):
 
 @pytest.fixture
 def ran(scripts, data, encoder, tmp_path):
-    """Folder of a ladder with one run of two rungs, both of whose policies were kept as they came."""
+    """Folder of a ladder with one run of two rungs and both policies."""
     work = tmp_path / "work"
     out = work / "runs" / "walker_walk" / "finetune-td3_bc"
     keep = scripts("ladder").keep_policies
@@ -73,7 +73,7 @@ def test_cloning_losses_match_an_agent(scripts, ran, encoder, monkeypatch):
     run = ran / "runs" / "walker_walk" / "finetune-td3_bc"
     record = read_json(run / "encoder" / "config.json")
     assert record["encoder"].pop("memory_options") == {"gru_layers": 1}
-    record["encoder"]["gru_layers"] = 1  # as the first runs have it
+    record["encoder"]["gru_layers"] = 1  # the layout of early runs
     write_json(run / "encoder" / "config.json", record)
     monkeypatch.setattr(script, "collect", collect)
     config = script.Config("cloning", ran, ran / "cloning.csv")
@@ -94,10 +94,10 @@ def test_cloning_losses_match_an_agent(scripts, ran, encoder, monkeypatch):
 
 
 def _loss(encoder, policy, data) -> float:
-    """Row by row: what an agent does in the episodes of a set, told the actions that the data took."""
+    """Mean squared error of an agent's actions in a dataset's episodes, given the stored previous actions."""
     network, card = load_encoder(encoder)
     agent, dataset = Agent(network, load_policy(policy)), open_dataset(data)
-    view = View(dataset, CorruptionConfig.fill(card.corruption), 0, 0, "finetune", 1)  # it learned from one
+    view = View(dataset, CorruptionConfig.fill(card.corruption), 0, 0, "finetune", 1)  # trained on one view
     obs = view.observe(torch.arange(dataset.num_rows))
     squares = []
     for first, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
@@ -111,12 +111,12 @@ def _loss(encoder, policy, data) -> float:
 def test_critic_drift_is_measured_on_the_last_fifth(scripts):
     script = scripts("ladder_table")
     rising = {step: 100.0 + step for step in range(1, 101)}
-    assert script.drift(rising, 100) == pytest.approx(20 / 190.5, rel=1e-4), "slope times length, over the mean"
-    assert script.drift(rising, 50) == pytest.approx(10 / 145.5, rel=1e-4), "as if training had ended there"
+    assert script.drift(rising, 100) == pytest.approx(20 / 190.5, rel=1e-4), "slope x length / mean"
+    assert script.drift(rising, 50) == pytest.approx(10 / 145.5, rel=1e-4), "for a training that ended there"
     assert script.drift({step: -100.0 - step for step in rising}, 100) == pytest.approx(20 / 190.5, rel=1e-4)
     wavy = {step: 100.0 + (-1) ** step for step in range(1, 101)}
     assert abs(script.drift(wavy, 100)) < 0.02
-    assert np.isnan(script.drift({90: 1.0, 100: 1.0}, 100)), "two values lie on any line"
+    assert np.isnan(script.drift({90: 1.0, 100: 1.0}, 100)), "two values are too few for a slope"
 
 
 def test_budget_is_the_first_converged_rung_near_the_lowest_loss(scripts):
@@ -124,7 +124,7 @@ def test_budget_is_the_first_converged_rung_near_the_lowest_loss(scripts):
     key = script.Key("walker_walk", "expert", "patch", "acro", 256, "bf16", 3000, 100, 4)
 
     def cell(*held_out, rises=0):
-        """Rungs at 100 to 400 updates; the critic's value rises until an update, and is level from then on."""
+        """Rungs at 100 to 400 updates; the critic's value rises for `rises` updates and is then constant."""
         rising = {step: min(step, rises) + 1.0 for step in range(1, 401)}
         return script.Cell(key, rising, dict(zip((100, 200, 300, 400), held_out, strict=True)))
 
@@ -134,5 +134,5 @@ def test_budget_is_the_first_converged_rung_near_the_lowest_loss(scripts):
     assert script.budget([cell(0.2, 0.3, 0.4, 0.5), cell(0.5, 0.4, 0.3, 0.2)]) is None
     assert script.budget([]) is None
     both = [cell(0.2, 0.3, 0.31, 0.4), cell(0.4, 0.4, 0.305, 0.3, rises=200)]
-    assert script.budget(both) == 300, "the lowest of the rungs at which all critics have converged"
+    assert script.budget(both) == 300, "the lowest loss among rungs at which all critics have converged"
     assert script.budget([cell(0.1, 0.2, 0.3, 0.4, rises=300)]) == 400, "rungs of a rising critic do not count"

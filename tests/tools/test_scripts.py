@@ -12,7 +12,7 @@ SCRIPTS = Path(__file__).parents[2] / "tools"
 
 
 def test_setup_recreates_environment_for_another_python(tmp_path):
-    """With interpreters that only say their version, note what they make, and agree to all else."""
+    """Uses fake interpreters that print their version, log created environments, and accept other commands."""
     (tmp_path / "tools").mkdir()
     shutil.copy(SCRIPTS / "setup.sh", tmp_path / "tools")
     for name in ("pyproject.toml", "constraints.txt"):

@@ -1,4 +1,4 @@
-"""The tools that train and export actors, and the returns on the cards of those that ship."""
+"""The tools that train and export actors, and the returns on the cards of shipped actors."""
 
 import importlib
 import json
@@ -22,7 +22,7 @@ AT_LEAST = {
     **{"reacher_jump_medium": 400, "point_mass_cue_medium": 500},
 }
 PLAYED = 8
-"""Episodes of a card that are played again."""
+"""Episodes of a card that are replayed."""
 SETTINGS = {"critic_norm": True, "n_step": 3, "envs": 2, "updates_per_decision": 0.5}
 
 
@@ -34,7 +34,7 @@ def exporting(monkeypatch):
 
 @pytest.fixture
 def training(exporting, monkeypatch):
-    """The script, with short episodes and runs that train after 40 decisions."""
+    """The script, with short episodes and early training."""
     module = importlib.import_module("train_actor")
     monkeypatch.setitem(TASKS._parts, "walker_walk", replace(TASKS["walker_walk"], decisions=100))
     monkeypatch.setattr(module, "RANDOM_DECISIONS", 20)
@@ -51,7 +51,7 @@ def configure(training):
 
 @pytest.mark.parametrize("name", ACTORS)
 def test_actors_reproduce_returns_of_their_cards(exporting, name):
-    """Half of the episodes to the digit: processors differ in a state's last bit, and some episodes magnify it."""
+    """At least half match exactly: processors differ in a state's last bit, which some episodes amplify."""
     task, quality = name.rsplit("_", 1)
     shipped = load_actor(task, quality)
     card = json.loads((actor.ASSETS / f"{name}.json").read_text())
@@ -62,8 +62,8 @@ def test_actors_reproduce_returns_of_their_cards(exporting, name):
     if differing:
         pytest.skip(f"the card was written with another {' and '.join(differing)}")
     found = np.array(exporting.episode_returns(shipped, TASKS.named(task), PLAYED))
-    said = np.array(card["returns"][:PLAYED])
-    assert (found == said).sum() >= PLAYED / 2, f"{found} in place of {said}"
+    recorded = np.array(card["returns"][:PLAYED])
+    assert (found == recorded).sum() >= PLAYED / 2, f"{found} in place of {recorded}"
 
 
 def test_exported_actor_equals_learner_network(training, configure, tmp_path):
@@ -103,12 +103,12 @@ def test_actor_training_resumes_and_warm_starts(training, exporting, configure, 
         file.write("999,1.0\n")
     training.train_actor(replace(config, decisions=120))
     steps = [step for step, _ in exporting.read_curve(config.out)]
-    assert steps == [40, 80, 120], "what no checkpoint has is forgotten"
+    assert steps == [40, 80, 120], "rows after the checkpoint are dropped"
     with pytest.raises(UserError, match="differs in n_step"):
         training.train_actor(replace(config, n_step=1))
 
     kept = tmp_path / "kept"
-    exporting.export_run(config.out, kept)  # what a repository would hold
+    exporting.export_run(config.out, kept)  # as committed to a repository
     new = configure(tmp_path / "new", decisions=180, start_from=kept, **SETTINGS)
     training.train_actor(new)
     assert [step for step, _ in exporting.read_curve(new.out)] == [40, 80, 120, 180]

@@ -84,7 +84,7 @@ def test_action_repeat_and_seed_change_the_dataset(maze_set, tmp_path):
     ("maze", "changes"), [("hard_no_curtain", {"noise": 1e4}), ("no_curtain", {"random_share": 1})]
 )
 def test_trajectories_have_independent_noise(maze, changes, tmp_path, monkeypatch):
-    """Under noise that drowns the planner, or in its place, actions are the noise's signs."""
+    """With noise far larger than, or in place of, the planner's action, actions have the noise's signs."""
     loud = replace(MAZES[maze].style, zero_share=0.0, **changes)
     monkeypatch.setitem(MAZES, maze, replace(MAZES[maze], style=loud))
     signs = np.sign([_roll_out((maze, i, 0, 30, 5))["action"][1:] for i in range(3)])

@@ -1,4 +1,4 @@
-"""What drives through the mazes, and that it drives as the paper's generator does."""
+"""Planners and policies that collect maze data, compared with the paper's generator."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_waypoints_lie_between_cell_centre_and_goal_point():
 
 
 def drive(maze: str, seeds: int) -> np.ndarray:
-    """States (seeds x 1500, P) of drives that are not drawn."""
+    """States (seeds x 1500, P) of unrendered trajectories."""
     env, states = MazeEnv(maze, pixels=False), []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
@@ -83,12 +83,12 @@ def drive(maze: str, seeds: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def top() -> np.ndarray:
-    """(N, 4) states under the paper's planner."""
+    """(N, 4) states visited by the paper's planner."""
     return drive("three_curtains", 6)
 
 
 def test_curtains_hide_the_expected_share_of_states(top):
-    """Theirs is hidden some 22% of the time: ours, if a seventh of the ball's radius may be left to see."""
+    """The paper reports about 22%, which is reached here if a seventh of the ball's radius may be visible."""
     three = MAZES["three_curtains"]
     assert three.hidden(top).mean() == pytest.approx(0.185, abs=0.02)
     nearly = replace(three, style=replace(three.style, hidden_reach=0.17))
@@ -98,7 +98,7 @@ def test_curtains_hide_the_expected_share_of_states(top):
 
 
 def test_uninformed_velocity_error_matches_the_paper(top):
-    """No History's velocity errors are printed as 91.5 to 91.9; as shares of a standard deviation they cannot be."""
+    """The paper's velocity errors of No History, 91.5 to 91.9, are only possible in raw units."""
     velocity = top[:, 2:]
     ignorance = np.abs(velocity - velocity.mean(0)).mean(0)
     assert 100 * ignorance.mean() == pytest.approx(91.5, rel=0.15)

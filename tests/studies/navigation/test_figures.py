@@ -11,7 +11,7 @@ TRUE, GUESS = (-1.0, 1.0), (1.0, -1.0)
 
 
 def write_table(path, points):
-    """A trajectory that goes through (true, estimated) points."""
+    """Write a trajectory of (true, estimated) points."""
     rows = [f"{t},{x},{y},0,0,{ex},{ey},0,0,1\n" for t, ((x, y), (ex, ey)) in enumerate(points)]
     path.write_text("t,x,y,vx,vy,estimated_x,estimated_y,estimated_vx,estimated_vy,hidden\n" + "".join(rows))
 
@@ -27,7 +27,7 @@ def at(frame: np.ndarray, point: tuple[float, float], panel: int = 0) -> np.ndar
 
 
 def ringed(frame: np.ndarray, point: tuple[float, float], panel: int) -> bool:
-    """Whether there is orange to the right of a point, at the mass's edge."""
+    """Whether the estimate's orange ring surrounds a point."""
     column, row = (round(number) for number in to_pixels(point[0] + BALL_RADIUS, point[1]))
     column += panel * SIDE
     there = frame[row - 2 : row + 3, column - 5 : column + 2]
@@ -39,10 +39,10 @@ def test_film_shows_true_and_estimated_positions(tmp_path):
     write_table(tmp_path / "wrong.csv", [(TRUE, GUESS), (GUESS, TRUE)])
     write_film({"right": tmp_path / "right.csv", "wrong": tmp_path / "wrong.csv"}, MAZE, tmp_path / "film.gif")
     frames = frames_of(tmp_path / "film.gif")
-    assert len(frames) == 2, "as many as the shortest has"
+    assert len(frames) == 2, "length of the shortest trajectory"
     assert frames[0].shape == (SIDE + HEAD, 2 * SIDE, 3)
     empty = at(frames[1], TRUE)
-    assert np.abs(at(frames[0], TRUE) - empty).max() > 5, "the mass under a curtain"
+    assert np.abs(at(frames[0], TRUE) - empty).max() > 5, "the mass is visible under a curtain"
     assert np.abs(at(frames[0], TRUE, 1) - empty).max() > 5
     rings = [[ringed(frames[0], point, panel) for point in (TRUE, GUESS)] for panel in (0, 1)]
     assert rings == [[True, False], [False, True]]

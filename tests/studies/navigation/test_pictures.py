@@ -27,8 +27,8 @@ def test_builtin_image_pools(name):
     assert torch.equal(pool, load_pool(name, 0))
     assert not torch.equal(pool, load_pool(name, 1))
     neighbours = (pool[..., 1:].float() - pool[..., :-1].float()).abs().mean()
-    strangers = (pool[1:].float() - pool[:-1].float()).abs().mean()
-    assert neighbours < strangers / 3, "pixels of natural images resemble their neighbours"
+    between_images = (pool[1:].float() - pool[:-1].float()).abs().mean()
+    assert neighbours < between_images / 3, "neighbouring pixels are similar"
 
 
 def test_exogenous_image_is_determined_by_the_row(noise):
@@ -59,7 +59,7 @@ def cifar_binary(folder, count: int = 4) -> np.ndarray:
 
 
 def torn_png() -> bytes:
-    """A PNG whose pixels are longer than they say, so that no chunk follows where one should."""
+    """A PNG with a wrong chunk length."""
     whole = io.BytesIO()
     noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
     Image.fromarray(noise).save(whole, "PNG")
@@ -87,7 +87,7 @@ def test_cifar_binary_and_python_files_agree(tmp_path):
 
 
 def test_pickles_are_not_executed(tmp_path):
-    """A batch that would write a file, were it unpickled, yields its pixels and nothing else."""
+    """A batch that would create a file if it were unpickled yields only its pixels."""
     pixels = bytes(range(256)) * 12
     call = b"cos\nsystem\nU" + bytes([len(f"touch {tmp_path}/harm")]) + f"touch {tmp_path}/harm".encode() + b"\x85R0"
     (tmp_path / "data_batch_1").write_bytes(b"\x80\x02" + call + python_batch(pixels)[2:])
@@ -140,7 +140,7 @@ def test_textures_have_the_spectrum_of_natural_images():
     chosen = (frequency > 0.02) & (frequency < 0.2)
     x, y = frequency[chosen].log(), power[chosen].log()
     slope = ((x - x.mean()) * (y - y.mean())).sum() / ((x - x.mean()) ** 2).sum()
-    assert -3.2 < slope < -1.6, "power falls about as the square of the frequency (Field 1987)"
+    assert -3.2 < slope < -1.6, "power decreases about as 1/f^2 (Field 1987)"
 
 
 def test_grey50_averages_the_luminance():

@@ -1,4 +1,4 @@
-"""The report about mazes: what it says, what it keeps, and what it refuses."""
+"""The navigation report: tables, verdicts, stored rows and invalid input."""
 
 import csv
 import json
@@ -36,7 +36,7 @@ STATE = refitted_error("state")
 
 
 def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bool = True) -> Path:
-    """A finished run whose every error is `level`, in raw units 1.5 times that, and whose losses grow with k."""
+    """A finished run with all errors equal to `level` (1.5 x in raw units) and losses that increase with k."""
     folder = base / condition.name / f"seed{seed}"
     folder.mkdir(parents=True)
     asked = {
@@ -45,7 +45,7 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
         "literal_future": condition.literal_future,
         "exogenous": condition.exogenous and "photographs",
     }
-    given = {name: value for name, value in asked.items() if value}  # not every method knows all of them
+    given = {name: value for name, value in asked.items() if value}  # not every method reads all of them
     config = jsonable(flat(NavigationConfig.of("cpu", seed=seed, **given)))
     command = f"vd4rl-pomdp navigation train --data data/{condition.maze} --method {condition.method} --seed {seed}"
     inputs = {"data": f"set of {condition.maze}"}
@@ -79,7 +79,7 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Path:
-    """Three seeds in one maze; tests that write take another folder."""
+    """Three seeds in one maze; tests must not write here."""
     base = tmp_path_factory.mktemp("navigation") / "runs"
     for seed in (0, 1, 2):
         for i, method in enumerate((*OBJECTIVES, "random")):
@@ -93,10 +93,10 @@ def loaded(*paths: Path) -> list[NavigationRun]:
     return load_runs(find_navigation(paths))
 
 
-def change(file: Path, **told) -> None:
-    """Put other values into a JSON file, one level deep where they are dicts."""
+def change(file: Path, **changes) -> None:
+    """Update a JSON file; dict values are merged one level deep."""
     stored = json.loads(file.read_text())
-    for name, value in told.items():
+    for name, value in changes.items():
         stored[name] = stored[name] | value if isinstance(value, dict) and name in stored else value
     file.write_text(json.dumps(stored))
 
@@ -133,7 +133,7 @@ def test_report_shows_means_seeds_and_paper_numbers(runs, tmp_path):
     assert "| **21.0** [18.5, 23.5] n=3 |" in page
     assert "**31.5** [27.8, 35.2] n=3 (6.0)" in page
     assert "Budget: 2,500 gradient steps on unknown samples, 5 minutes a run (some, 2 cores)." in page
-    assert page.count("--seed 1  # ") == 10, "one command for every run of seed 1"
+    assert page.count("--seed 1  # ") == 10, "one command per run of seed 1"
     assert "no run (" not in page
     for name in ("accuracy.png", "accuracy_raw.png", "trajectories.png"):
         assert (tmp_path / "out" / "figures" / name).stat().st_size > 5_000
@@ -146,7 +146,7 @@ def test_report_is_reproducible_and_extendable(runs, tmp_path):
     for name, content in kept.items():
         assert (tmp_path / "again" / name).read_bytes() == content
     assert (tmp_path / "again" / "trajectories" / TRAJECTORY).is_file()
-    assert len(loaded(tmp_path / "out", runs)) == len(loaded(runs)), "a run that is told of twice counts once"
+    assert len(loaded(tmp_path / "out", runs)) == len(loaded(runs)), "runs found twice count once"
     write_run(tmp_path / "more", Condition("three_curtains", "supervised"), 0, 8.0)
     with pytest.raises(UserError, match="30 runs that would be lost"):
         write_report([tmp_path / "more"], tmp_path / "out")
@@ -161,7 +161,7 @@ def test_report_lists_differing_settings(tmp_path):
     untrained = write_run(tmp_path / "runs", Condition("no_curtain", "random"), 0, 1.0)
     change(untrained / "timing.json", steps=0)
     write_report([tmp_path / "runs"], tmp_path / "out")
-    assert "Not alike" not in (tmp_path / "out" / "report.md").read_text(), "self-prediction and no training are told"
+    assert "Not alike" not in (tmp_path / "out" / "report.md").read_text(), "conditions may differ"
     change(longer / "timing.json", steps=9000)
     for run in (*alike, untrained):
         change(run / "results.json", set="set of more")
@@ -173,7 +173,7 @@ def test_report_lists_differing_settings(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("file", "told", "name"),
+    ("file", "changes", "name"),
     [
         ("timing.json", {"steps": 30}, "steps"),
         ("results.json", {"set": "b17"}, "set"),
@@ -181,14 +181,14 @@ def test_report_lists_differing_settings(tmp_path):
         ("config.json", {"inputs": {"exogenous": "f2"}}, "exogenous"),
     ],
 )
-def test_seeds_with_different_settings_are_rejected(tmp_path, file, told, name):
+def test_seeds_with_different_settings_are_rejected(tmp_path, file, changes, name):
     condition = Condition("no_curtain", "ah", exogenous=True)
     folders = [write_run(tmp_path / "runs", condition, seed, 9.0) for seed in (0, 1)]
-    for folder, images in zip(folders, ("/a/cifar", "/b/cifar"), strict=True):  # one content at two places
+    for folder, images in zip(folders, ("/a/cifar", "/b/cifar"), strict=True):  # equal content in two folders
         logging = {"exogenous": images, "log_every": 10 * len(images)}
         change(folder / "config.json", config=logging, inputs={"exogenous": "f1"})
     assert len(loaded(tmp_path / "runs")) == 2
-    change(folders[1] / file, **told)
+    change(folders[1] / file, **changes)
     with pytest.raises(UserError, match=f"seeds 0 and 1 differ in their {name}"):
         loaded(tmp_path / "runs")
 
@@ -206,7 +206,7 @@ def test_report_shows_missing_and_unfinished_runs(runs, tmp_path, monkeypatch):
     assert f"`{unfinished}` at 40 of 2500 steps." in page
     line = next(line for line in page.splitlines() if line.startswith("| MIK, K=15 |") and "(13.1)" in line)
     assert "n=2 of 3 (13.1)" in line
-    assert line.startswith("| MIK, K=15 | no run (6.6) | (12.3) |"), "nobody has been in the other mazes"
+    assert line.startswith("| MIK, K=15 | no run (6.6) | (12.3) |"), "no runs in the other mazes"
     rows = list(csv.DictReader((tmp_path / "out" / "tables.csv").open()))
     missing = [row for row in rows if row["row"] == "MIK, K=15" and row["maze"] == "no_curtain"]
     assert {(row["seeds"], row["mean"]) for row in missing} == {("0", "")}
@@ -227,9 +227,9 @@ def test_bar_plot_marks_paper_numbers_and_missing_runs(runs, tmp_path, monkeypat
     write_run(tmp_path / "runs", Condition("three_curtains", "no_history"), 0, 121.0, raw=False)
     assert not figures.accuracy_bars(loaded(tmp_path / "runs"), STATE.raw(), tmp_path / "bars.png")
     ends = []
-    monkeypatch.setattr("matplotlib.axes.Axes.set_ylim", lambda axes, *told, **_: ends.append(told))
+    monkeypatch.setattr("matplotlib.axes.Axes.set_ylim", lambda axes, *limits, **_: ends.append(limits))
     figures.accuracy_bars(loaded(tmp_path / "runs"), STATE, tmp_path / "bars.png")
-    assert min(told[0] for told in ends if len(told) == 2) == -21, "an error of more than 100 is in the picture"
+    assert min(limits[0] for limits in ends if len(limits) == 2) == -21, "errors above 100 are visible"
 
 
 def test_first_person_claims_are_judged(tmp_path):
@@ -237,10 +237,10 @@ def test_first_person_claims_are_judged(tmp_path):
     for (method, sp), level in levels.items():
         write_run(tmp_path, Condition("compass_first_person", method, self_prediction=bool(sp)), 0, level)
     found = numbers_of(loaded(tmp_path))
-    told = [
+    judged = [
         claim for claim in claims("compass_first_person") if "state error" in claim.text and "K=1" not in claim.text
     ]
-    assert {claim.text: judge(claim, found).holds for claim in told} == {
+    assert {claim.text: judge(claim, found).holds for claim in judged} == {
         "state error of mik+a, of the untrained one's": False,
         "state error of mik+a": False,
         "no_history's state error, of that of mik+a": True,
@@ -249,7 +249,7 @@ def test_first_person_claims_are_judged(tmp_path):
         "no_history's state error, of that of mik+a with self-prediction": True,
         "ah+a's state error, of no_history's": False,
     }
-    assert told[1].raw() == told[1], "15% is no number of raw units"
+    assert judged[1].raw() == judged[1], "the threshold of 15% is not in raw units"
 
 
 def test_report_shows_verdicts_beside_the_paper(runs):
@@ -274,7 +274,7 @@ def test_report_shows_verdicts_beside_the_paper(runs):
 
 
 def test_report_shows_effect_of_raw_units(tmp_path):
-    """In raw units no_history's errors shrink to a tenth: the statement about its velocity holds no more."""
+    """In raw units no_history's errors are a tenth, so the claim about its velocity no longer holds."""
     for method, level in (("mik+a", 21.0), ("no_history", 81.0)):
         results = write_run(tmp_path / "both", Condition("three_curtains", method), 0, level) / "results.json"
     rows = json.loads(results.read_text())["rows"]

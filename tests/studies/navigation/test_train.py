@@ -100,9 +100,9 @@ def test_probe_does_not_change_encoder_gradients(maze_set, tmp_path):
     window = trainer.batches.sample()
     past, future = probed.objective.representations(window)
     loss, _ = probed.objective.loss_of(past, future, window, 0.0)
-    alone = torch.autograd.grad(loss, list(probed.objective.parameters()), retain_graph=True)
-    together = torch.autograd.grad(probed.loss(window, 0.0)[0], list(probed.objective.parameters()))
-    for one, other in zip(alone, together, strict=True):
+    expected = torch.autograd.grad(loss, list(probed.objective.parameters()), retain_graph=True)
+    with_probe = torch.autograd.grad(probed.loss(window, 0.0)[0], list(probed.objective.parameters()))
+    for one, other in zip(expected, with_probe, strict=True):
         torch.testing.assert_close(one, other)
     probed.loss(window, 0.0)[0].backward()
     assert all(parameter.grad is not None for parameter in probed.probe.parameters())
@@ -178,8 +178,8 @@ def test_learning_rate_schedule():
 
 def test_exogenous_noise_is_added_to_observations(maze_set, tmp_path):
     for picture, shape in (("grey50", (1, 50, 50)), ("rgb50", (3, 50, 50)), ("rgb100", (3, 100, 100))):
-        told = {"picture": picture, "frame_encoder": "nature"}
-        configs = [smoke(maze_set, tmp_path, exogenous=noise, **told) for noise in ("none", "photographs")]
+        given = {"picture": picture, "frame_encoder": "nature"}
+        configs = [smoke(maze_set, tmp_path, exogenous=noise, **given) for noise in ("none", "photographs")]
         clean, noisy = (MazeData(config).on(torch.device("cpu")) for config in configs)
         number = torch.tensor([0, 40])
         first, second = clean.windows(number), noisy.windows(number)
@@ -261,7 +261,7 @@ def probed(maze_set) -> ProbedObjective:
 
 
 def shift_states(probed: ProbedObjective, held_out: bool) -> None:
-    """Move the true states of the training or of the held-out rows."""
+    """Shift the true states of the training or held-out rows."""
     split = int(probed.data.dataset.episode_start[probed.data.first_held_out])
     probed.data.states[slice(split, None) if held_out else slice(split)] += 3
 

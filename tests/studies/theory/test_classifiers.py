@@ -50,7 +50,7 @@ def test_more_visible_variables_never_increase_entropy(world):
 
 
 def test_mik_a_differs_from_multi_step_inverse_on_the_counterexample():
-    """Where the future does not decode, MIK+A's classifier is not the multi-step inverse, and this is noticed."""
+    """Where the future is not decodable, MIK+A's classifier is not the multi-step inverse."""
     row = compare(counterexample(), VIEWS["mik+a"], MemoryLengths(3, 3), 2)
     assert not row.decodes_end
     assert not row.multi_step
@@ -62,7 +62,7 @@ def test_mik_a_differs_from_multi_step_inverse_on_the_counterexample():
 
 
 def test_fj_a_sees_actions_up_to_m():
-    """FJ+A knows a_t up to k = m+1, and more than the two states at k = m+2: the later window reaches back to t+k-m."""
+    """FJ+A determines a_t up to k = m+1, because its later window begins at t+k-m."""
     rows = [compare(counterexample(), VIEWS["fj+a"], MemoryLengths(3, 3), k) for k in range(1, 7)]
     assert [row.certain for row in rows] == [True] * 4 + [False] * 2
     assert [row.sees_action for row in rows] == [True] * 3 + [False] * 3

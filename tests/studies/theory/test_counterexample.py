@@ -17,7 +17,7 @@ K4 = """
 --+- -+-- +--- +++- 2 -1
 ---+ -+++ +-++ ++-+ 2 1
 """
-"""The appendix's lists of examples from (0, -1) and (0, 1), which are the same for both."""
+"""The appendix's lists of examples, which are equal for (0, -1) and (0, 1)."""
 
 
 def appendix_k4():
@@ -39,7 +39,7 @@ def test_enumeration_matches_the_papers_counts():
     found = enumerated(counterexample())
     assert found["examples"] == 16368
     assert set(range(4, 11)) <= set(found["uniform_k"])
-    assert found["uniform_k"] == list(range(3, 11)), "k = 3 is uniform, too"
+    assert found["uniform_k"] == list(range(3, 11)), "k = 3 is also uniform"
     assert found["informative_k"] == [1, 2]
     assert (found["diameter"], found["m_with_actions"], found["period"]) == (3, 3, 2)
     assert found["by_k"][1] == {"k": 2, "examples": 32, "pairs": 32, "certain": 32, "uniform": 0}

@@ -21,7 +21,7 @@ LONGEST = 3
 
 
 def tells(world, seen, row):
-    """Whether what is seen determines s at a row, in every sequence that begins anywhere in the world."""
+    """Whether `seen` determines the state at a row in all sequences from any initial state."""
     anywhere = replace(world, initial=uniform(world.reachable()))
     return joint_law(anywhere, [*seen, ("s", row)]).tells(seen, [("s", row)])
 
@@ -42,7 +42,7 @@ def literal(length):
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("actions", [True, False])
 def test_memory_lengths_match_enumeration(actions, world):
-    """Enumeration of all sequences up to a length finds the same smallest memory, or none up to that length."""
+    """Enumerating all sequences up to a length gives the same smallest memory, or none."""
     for memory, enough in (
         (past_memory(world, actions), lambda n: tells(world, past(n, actions), n)),
         (future_memory(world, actions), lambda n: tells(world, future(n, actions), 0)),

@@ -1,4 +1,4 @@
-"""The ten statements of the paper that enumeration contradicts: numbers by hand, and what is left of the claims."""
+"""Statements of the paper that enumeration contradicts, with numbers by hand, and the weaker claims that hold."""
 
 from fractions import Fraction
 from itertools import combinations, product
@@ -38,7 +38,7 @@ def test_facts_have_computed_values():
 
 
 def test_ladder_counterexample():
-    """From its first step (0, 0), (1, 0) and (1, 1) lead to the ground; if it is reached at once, only the first."""
+    """(0, 0), (1, 0) and (1, 1) lead from the first step to the ground; only (0, 0) reaches it immediately."""
     for method in ("fj", "fj+a"):
         found = clash(tiny("ladder"), VIEWS[method], MemoryLengths(1, 0), 2)
         assert (found.action, found.exact, found.multi_step, found.states) == (0, 1, Fraction(1, 3), (1, 0))
@@ -63,7 +63,7 @@ def test_mik_a_has_no_clash_if_states_are_decodable(method, world, m, n):
 
 
 def merged(world, max_k):
-    """Pairs of states that one encoder on true states may merge."""
+    """Pairs of states that an encoder of true states may merge."""
     found = state_relation(world, range(1, max_k + 1))
     apart, number = found.conflicts(), found.histories
     return {frozenset(pair) for pair in combinations(world.states, 2) if not apart[number[pair[:1]], number[pair[1:]]]}
@@ -80,7 +80,7 @@ def test_state_encoder_merges_only_states_of_different_rows():
 
 
 def bounded(view):
-    """MIK+A as the paper counts its future: n actions beside n+1 observations, so without the last row's."""
+    """MIK+A's view with the paper's count of the future: n+1 observations and n actions."""
     last = max(j for kind, j in view if kind == "o")
     return view - {("a", last)}
 
@@ -94,7 +94,7 @@ def test_fj_beyond_m_equals_mik_at_a_shorter_gap(m):
 
 
 def is_shorter_gap(world, m, k, actions=True):
-    """Whether FJ+A (or FJ) at k > m is P(a_t | s_t, s_{t+k-m}); None where a view does not tell its state."""
+    """Whether FJ+A (or FJ) at k > m is P(a_t | s_t, s_{t+k-m}); None if a view does not determine its state."""
     view, ends = VIEWS["fj+a" if actions else "fj"], [("s", m), ("s", k)]
     past, later = view.start(m, m), view.end(m, k, m, 0, m + k + 1)
     law = joint_law(world, {*past, *later, *ends, ("a", m)})
@@ -115,7 +115,7 @@ def test_fj_beyond_m_is_the_inverse_of_the_shorter_gap(actions, world):
 
 
 def test_shorter_gap_differs_from_the_printed_one():
-    """Where the later window tells its first state, and the gap makes a difference."""
+    """If the later window determines its first state and the gap matters."""
     assert is_shorter_gap(echo(), 1, 3) is True
     assert clash(echo(), VIEWS["fj+a"], MemoryLengths(1, 1), 3) is not None
     assert is_shorter_gap(tiny("hidden switch"), 1, 2) is None

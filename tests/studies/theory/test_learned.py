@@ -1,7 +1,7 @@
-"""Learned meets exact: the real objectives, trained on exact sequences, reach the exact conditional entropies.
+"""Objectives trained on exact sequences reach the exact conditional entropies.
 
-The loss of any predictor is at least H(a_t | what it sees), so these are two-sided: a loss above the bound by more than
-the tolerance means that an objective does not use what it may see, one below it that it sees more.
+The loss of any predictor is at least H(a_t | inputs), so tests are two-sided: a loss above the bound means that an
+objective does not use all its inputs, a loss below it that it sees more than declared.
 """
 
 from itertools import product
@@ -23,7 +23,7 @@ from vd4rl_pomdp.studies.theory.world import BLANK, World, biased, counterexampl
 
 MAX_K, M = 2, 1
 ABOVE, BELOW = 0.02, 1e-4
-"""Tolerances in nats; rounding in float32 explains the second."""
+"""Tolerances in nats; the second allows float32 rounding."""
 
 
 WORLDS = {"shorter counter": lambda: counterexample(every=2), "ladder": lambda: biased(noisy(tiny("ladder")))}
@@ -55,7 +55,7 @@ def build(world: World, method: str, max_k: int, m: int = M, hidden: int = 32) -
 
 
 def train(objective: InverseObjective, data: ExactWindows, steps: int, exactly: bool = False) -> None:
-    """Minimise the objective's loss on drawn batches, or (exactly) the expected loss over all sequences."""
+    """Minimise the loss on sampled batches or, if `exactly`, the expected loss over all sequences."""
     generator = torch.Generator().manual_seed(0)
     optimiser = torch.optim.Adam(objective.parameters(), 1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-2 if exactly else 8e-3, steps)
@@ -109,11 +109,10 @@ def test_losses_reach_the_exact_conditional_entropy(world_name, method):
 
 @pytest.fixture(scope="module")
 def papers_world():
-    """The paper's counterexample, windows that reach from one shown state to the next, and MIK+A trained on them.
+    """The paper's counterexample, windows from one visible state to the next, and MIK+A trained on them.
 
-    At k = 1 the target is the parity of both shown states and of the three moves between them; no subset of these says
-    anything. Its signal drowns in the noise of drawn batches, so that training stays where MIK is. The exact gradient
-    has no noise.
+    At k = 1 the target is the parity of both visible states and the three moves between them, and no subset is
+    informative. Training on sampled batches stays at MIK's loss, so the exact gradient is used.
     """
     world = counterexample()
     data = exact_windows(world, 5)
@@ -127,14 +126,14 @@ def test_mik_a_reaches_the_exact_entropy_of_the_papers_world(papers_world):
     exact = exact_loss(world, "mik+a", 1, 5)
     with torch.no_grad():
         assert exact - BELOW < expected_loss(objective, data) < exact + ABOVE
-    assert exact + 5 * ABOVE < exact_loss(world, "mik", 1, 5), "the tolerance must tell MIK+A from MIK"
+    assert exact + 5 * ABOVE < exact_loss(world, "mik", 1, 5), "the tolerance must separate MIK+A from MIK"
 
 
 @torch.no_grad()
 def losses_after_swaps(objective: InverseObjective, data: ExactWindows, world: World, t: int) -> dict:
-    """Pair of states -> mean loss at (t, 1) when each window's past state at t is that of a window in the other state.
+    """Pair of states -> mean loss at (t, 1) after exchanging past states at t between windows in the two states.
 
-    Of windows whose first row shows the state: from there to the next one shown, everything counts.
+    Uses windows whose first row shows the state.
     """
     blank = world.symbols.index(BLANK)
     shown = (data.windows.obs[:, 0].flatten(1).argmax(1) != blank).nonzero()[:, 0]
@@ -149,10 +148,10 @@ def losses_after_swaps(objective: InverseObjective, data: ExactWindows, world: W
 
 
 def test_learned_encoders_merge_states_as_predicted(papers_world):
-    """Exchange past states between states and see whether predictions mind: only where theory separates the states.
+    """Exchanging past states between states affects predictions only where theory separates the states.
 
-    With k = 1 <= m, FJ+A may merge all states. MIK+A must tell x from x+2 and may merge (x, -1) with (x, +1). States of
-    different parity never compete for one future, so that theory leaves them open.
+    With k = 1 <= m, FJ+A may merge all states. MIK+A must separate x from x+2 and may merge (x, -1) with (x, +1).
+    Theory makes no statement on states of different parity, which never compete for one future.
     """
     world, data, mik_a = papers_world
     fj_a = build(world, "fj+a", 1, m=3)

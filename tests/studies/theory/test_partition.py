@@ -41,7 +41,7 @@ def test_conflicts_are_pairs_that_cannot_merge(method, world):
 
 
 def test_fj_merges_states_that_mik_a_separates():
-    """Up to k = D = m = 3, FJ and FJ+A let s^A go; MIK+A has to tell s^A = x from x+2."""
+    """Up to k = D = m = 3, FJ and FJ+A may discard s^A, but MIK+A must separate s^A = x from x+2."""
     world = counterexample()
     assert classes(world, "fj", 3) == [0] * 8
     assert classes(world, "fj+a", 3) == [0, 1] * 4

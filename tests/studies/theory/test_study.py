@@ -15,7 +15,7 @@ OUT = "page"
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
-    """What the command prints as JSON, and the folder it writes."""
+    """The command's JSON output, and the folder it writes."""
     import contextlib
     import io
 
@@ -55,7 +55,7 @@ def test_equations_that_fail_under_their_assumptions(shown):
 
 
 def test_printed_entries_that_fail_under_their_assumptions(shown):
-    """All follow from five facts; what the paper does not claim is not among them."""
+    """All follow from five facts; entries that the paper does not claim are excluded."""
     study, _ = shown
     rows = [(row["world"], row["method"], row["printed"]) for row in study["differences"]]
     assert [row for row in rows if row[2] == "discards"] == [("counterexample", "fj+a", "discards")]
@@ -94,8 +94,8 @@ def test_report_includes_the_theory_section(shown, tmp_path):
     run = write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
     text = write_report([run, folder], tmp_path / "out")[0].read_text()
     assert study["facts"][0]["title"] in text
-    alone, *_ = write_report([run], tmp_path / "alone")
-    assert "finite worlds" not in alone.read_text()
+    without, *_ = write_report([run], tmp_path / "without")
+    assert "finite worlds" not in without.read_text()
 
 
 def test_invalid_studies_are_rejected(shown, tmp_path):

@@ -45,7 +45,7 @@ def test_invalid_worlds_are_rejected(changes, message):
 
 
 def brute_force(world, rows):
-    """The joint law of everything, sequence by sequence, in fractions."""
+    """The joint law of all variables in fractions, by enumerating sequences."""
     law = {}
 
     def extend(sequence, pair, p, row):
