@@ -248,7 +248,7 @@ def test_page_and_terminal_show_claims(tmp_path, capsys):
     shown = " ".join(capsys.readouterr().out.split())
     assert f"{FIRST} (exploratory): holds in 0 of 1 setting; too few seeds in 1" in shown, "mik's one seed is higher"
     assert f"{ACTIONS} (primary): holds in 0 of 1 setting; too few seeds in 1" in shown
-    assert "told the states" not in shown
+    assert "trained on the states" not in shown, "distances have no verdict"
 
 
 def test_tally_counts_unjudged_settings_by_reason():
