@@ -57,6 +57,20 @@ def test_only_the_same_run_resumes(tmp_path):
         begin(tmp_path)
 
 
+def test_a_run_from_before_a_setting_resumes_with_the_value_that_it_implied(tmp_path):
+    @dataclass(frozen=True)
+    class Later(Config):
+        keep_newest: bool = False
+
+    with begin(tmp_path):
+        pass
+    with RunFolder(tmp_path, "stage", Later(tmp_path), INPUTS):
+        pass
+    assert read_json(tmp_path / "config.json")["config"].get("keep_newest", False) is False
+    with pytest.raises(UserError, match=r"a different config \(keep_newest\)"):
+        RunFolder(tmp_path, "stage", Later(tmp_path, keep_newest=True), INPUTS)
+
+
 @pytest.mark.parametrize("content", ["thesis.txt", "config.json"])
 def test_foreign_folder_is_rejected(tmp_path, content):
     (tmp_path / content).write_text("{}")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import RUNTIME_FIELDS, flat, settings_of
+from vd4rl_pomdp.core.options import LATER, RUNTIME_FIELDS, flat, settings_of
 from vd4rl_pomdp.core.registry import code_of, warn_of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State
@@ -108,6 +108,7 @@ class RunFolder:
                 "and cannot resume it; choose another --out"
             )
         config, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
+        config = LATER | config
         differing = sorted(k for k in self.config.keys() - RUNTIME_FIELDS if config.get(k) != self.config[k])
         if stored["stage"] != self.stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
