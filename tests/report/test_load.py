@@ -1,5 +1,7 @@
 """Loading runs for a report: pooling, gaps and damaged files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report.load import find_gaps, load_runs
 from vd4rl_pomdp.report.page import unlike, write_report
 from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.results import find_results, write_results
 
 
 def test_invalid_runs_are_rejected(tmp_path):
@@ -24,6 +27,13 @@ def test_invalid_runs_are_rejected(tmp_path):
     with pytest.raises(UserError, match="a line is not JSON of numbers"):
         write_report([tmp_path / "a"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_one_run_twice_in_a_results_folder_is_no_second_seed(tmp_path):
+    (run,) = find_results([write_run(tmp_path / "a", "acro", 0, {10: [1.0, 3.0]})])
+    write_results(tmp_path / "results", [run, replace(run, id="another")])
+    with pytest.raises(UserError, match=f"run another and .*run {run.id}: two runs with the same method"):
+        load_runs([tmp_path / "results"])
 
 
 def test_damaged_film_is_rejected(tmp_path):

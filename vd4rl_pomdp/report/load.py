@@ -221,11 +221,13 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
     UserError if there is no run, two have the same identity, or a file of one is damaged.
     """
     runs = _distinguished([_load(result) for result in choice.among(find_results(paths, but))])
-    seen: dict[tuple[Any, ...], Path] = {}
+    seen: dict[tuple[Any, ...], Run] = {}
     for run in runs:
-        path = run.result.path
-        if run.rows and (other := seen.setdefault(run.of(IDENTITY), path)) is not path:
-            raise UserError(f"{path} and {other}: two runs with the same method, setting and seed; report one of them")
+        if run.rows and (other := seen.setdefault(run.of(IDENTITY), run)) is not run:
+            raise UserError(
+                f"{run.result.place} and {other.result.place}: two runs with the same method, setting and seed; report "
+                "one of them"
+            )
     return runs
 
 
