@@ -8,6 +8,7 @@ from pretrain.objectives import METHODS
 from tests.helpers_stages import option_names
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import NO_OPTIONS, flat
+from vd4rl_pomdp.runs.files import content_hash, jsonable
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
 
@@ -32,6 +33,12 @@ def test_unread_options_are_rejected(settings, reader):
     name = next(name for name in settings if name not in PretrainConfig.choosers or name == "action_target")
     with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by .*{reader}.*: leave it out"):
         PretrainConfig.of("smoke", **settings).check()
+
+
+def test_a_whole_number_is_the_setting_that_a_command_line_gives():
+    settings = [jsonable(flat(FinetuneConfig.of("smoke", alpha=alpha, learning_rate=1))) for alpha in (5, 5.0)]
+    assert content_hash(settings[0]) == content_hash(settings[1])
+    assert type(settings[0]["updates"]) is int
 
 
 def test_state_frame_encoder_is_limited_to_some_methods():

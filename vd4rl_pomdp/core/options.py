@@ -38,6 +38,8 @@ LATER = {"future_frames": "all", "view_seed": None, "keep_newest": False, "hold_
 LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
 """Columns that identify a run's rows."""
 
+_FLOAT = (float, float | None, "float", "float | None")  # a field's type is text under postponed annotations
+
 Limits = Mapping[str, float | tuple[float, float]]
 """By name, a number's minimum, or minimum and maximum."""
 
@@ -145,7 +147,10 @@ def _check_options(config: Any) -> None:
 
 
 def flat(config: Any) -> dict[str, Any]:
-    """All settings of a config by name, with nested options; UserError if two share a name and thus a flag."""
+    """All settings of a config by name, with nested options; UserError if two share a name and thus a flag.
+
+    A whole number for a float field becomes a float, as on the command line: 5 and 5.0 are one setting, with one hash.
+    """
     found: dict[str, Any] = {}
     owners: dict[str, str] = {}
 
@@ -163,7 +168,8 @@ def flat(config: Any) -> dict[str, Any]:
                     f"{owners[name]} and {owner} both have the setting {name!r}, so {flag_of(name)} would be "
                     "ambiguous: rename it in your own part"
                 )
-            found[name], owners[name] = value, owner
+            whole = type(value) is int and field.type in _FLOAT
+            found[name], owners[name] = float(value) if whole else value, owner
 
     add(config)
     return found
