@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 import pretrain.objectives
-from tests.helpers_report import describe, grid, pretraining, write_run, write_seeds
+from tests.helpers_report import describe, grid, pretraining, without_figures, write_run, write_seeds
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
@@ -26,6 +26,7 @@ from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.report.render import write_latex
 from vd4rl_pomdp.runs.episodes import drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.results import find_results, keep_certificates
 
 ROOT = Path(__file__).parents[2]
 
@@ -210,6 +211,18 @@ def test_report_is_reproducible_from_its_own_folder(tmp_path):
     rows = (tmp_path / "two" / "runs.jsonl").read_bytes()
     write_report([tmp_path / "two"], tmp_path / "two")
     assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows, "a report in place keeps its rows"
+
+
+def test_a_report_keeps_its_certificates_however_its_folder_is_named(tmp_path, monkeypatch):
+    without_figures(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path / "runs/a", "acro", 0, {10: [25.0]})
+    out, (run,) = Path("report"), find_results(["runs"])
+    write_report([Path("runs")], out)
+    about = {"data": "", "corruption": {}, "name": "patch", "verdict": "needs a memory", "why": "R2", "made": "now"}
+    keep_certificates(out, {run.certificate: about})
+    for name in (out, tmp_path / "report"):
+        assert list(write_report([name], out).summary["memory"]) == ["needs a memory (R2)"]
 
 
 HOSTILE = '$\\frac$ <b>=1+1</b>, "x"|`y`\n[/red]_\u2028μ'
