@@ -88,7 +88,8 @@ def close(one, other) -> None:
 def test_seeds_option_writes_folders_equal_to_single_runs(encoder, data, tmp_path, monkeypatch, algorithm):
     words = ["finetune", "--preset", "smoke", "--encoder", str(encoder), "--data", str(data), "--algorithm", algorithm]
     words += ["--updates", "12", "--eval-every", "6", "--batch-size", "4", "--eval-length", "2", "--workers", "1"]
-    for call in (["--seeds", "0,3", "--out", str(tmp_path / "s")], ["--seed", "3", "--out", str(tmp_path / "alone")]):
+    monkeypatch.setenv("HOME", str(tmp_path))  # a shell leaves --out=~/s to the command
+    for call in (["--seeds", "0,3", "--out=~/s"], ["--seed", "3", "--out", str(tmp_path / "alone")]):
         monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", *words, *call])
         main()
     same_but_for_rounding(tmp_path / "s" / "seed3", tmp_path / "alone")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,8 @@ def _of_seeds(words: list[str]) -> list[list[str]]:
         raise UserError("--seed and --seeds are both given: leave one out")
     if not given.out:
         raise UserError("--seeds needs --out OUT: its runs are OUT/seed0 and so on")
-    return [[*rest, "--seed", seed, "--out", str(Path(given.out) / f"seed{seed}")] for seed in seeds]
+    out = Path(os.path.expanduser(given.out))  # as `parse` does in --out=~/runs, which no shell expands
+    return [[*rest, "--seed", seed, "--out", str(out / f"seed{seed}")] for seed in seeds]
 
 
 @dataclass(frozen=True)
