@@ -114,6 +114,14 @@ def test_folder_names_of_other_runs_are_not_reused(copy):
     assert left(plan(copy)) == []
 
 
+def test_a_narrowed_grid_and_a_changed_one_are_two_plans(tmp_path, monkeypatch):
+    monkeypatch.setattr("vd4rl_pomdp.cli.sweeps.carry_out", lambda *_: None)
+    (tmp_path / "grid.toml").write_text(GRID)
+    for flag in ("--only", "--change"):
+        main(["sweep", "run", str(tmp_path / "grid.toml"), "--out", str(tmp_path), flag, "preset=smoke"])
+    assert len(SweepFolder(tmp_path).plans()) == 2
+
+
 def test_folder_names_planned_by_another_grid_are_not_reused(tmp_path, capsys):
     """No run of either grid has begun."""
     folder = SweepFolder(tmp_path)

@@ -92,7 +92,8 @@ def run(words: list[str], program: str) -> None:
     refuse_kept(config.out)
     folder = SweepFolder(config.out)
     file = [str(Path(config.grid).resolve())] * (config.grid not in names())  # a different file is a different grid
-    name = plan_name(grid.name, [*file, *config.only, *config.change, *["testing"] * config.testing])
+    changes = (f"change {word}" for word in config.change)  # not to be taken for the same words of --only
+    name = plan_name(grid.name, [*file, *config.only, *changes, *["testing"] * config.testing])
     data, others = config.data or config.out / DATA, folder.jobs_of_others(name)
     jobs, warnings = plan_jobs(cells, config.out, data, runs_kept(config.done), others)
     for job in jobs:
