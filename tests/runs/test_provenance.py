@@ -74,7 +74,7 @@ def test_wheel_contains_its_commit(checkout):
         ("-c", "vd4rl-pomdp"),
         ("/src/pretrain/__main__.py", "vd4rl-pomdp pretrain"),
         ("/src/finetune/__main__.py", "vd4rl-pomdp finetune"),
-        ("my_method.py", "my_method.py"),
+        ("folder/my_method.py", "python my_method.py"),
     ],
 )
 def test_command_is_recorded_as_typed(monkeypatch, script, program):

@@ -100,7 +100,7 @@ def command(stage: str = "", words: Sequence[str] | None = None) -> str:
         words: that run's arguments; None: all of the command line's.
     """
     script = Path(sys.argv[0])
-    program = [script.name]
+    program = [*["python"] * (script.suffix == ".py"), script.name]
     if script.name in ("__main__.py", "-c"):  # python -m PACKAGE, or a spawned worker
         program = ["vd4rl-pomdp", *([script.parent.name] if script.parent.name in ("pretrain", "finetune") else [])]
     given = sys.argv[1:] if words is None else [*(word for word in sys.argv[1:2] if word == stage), *words]
