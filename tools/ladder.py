@@ -18,6 +18,8 @@ import sys
 import time
 from pathlib import Path
 
+from vd4rl_pomdp.runs.files import write_csv
+
 RESULTS = Path(__file__).parent.parent / "results" / "ladder"
 CURVES = ("q", "critic_loss", "actor_loss", "bc_loss")
 PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
@@ -42,12 +44,14 @@ def keep_policies(runs: Path, snapshots: Path) -> None:
 def keep_rows(runs: Path) -> int:
     """Add finished runs to results/ladder, and their losses and critic values to its curves.csv."""
     code = subprocess.run([PROGRAM, "results", "add", str(runs), "--out", str(RESULTS)]).returncode
-    with (RESULTS / "curves.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, ["run", "step", *CURVES], lineterminator="\n")
-        table.writeheader()
-        for metrics in sorted(runs.rglob("finetune-*/metrics.jsonl")):
-            if (metrics.parent / "timing.json").exists():
-                table.writerows({"run": metrics.parent.relative_to(runs).as_posix()} | row for row in curve_of(metrics))
+    path = RESULTS / "curves.csv"
+    rows: list[dict[str, str]] = list(csv.DictReader(path.open(newline=""))) if path.exists() else []
+    known = {row["run"] for row in rows}  # also of runs in other work folders, which `sweep run --done` skips here
+    for metrics in runs.rglob("finetune-*/metrics.jsonl"):
+        name = metrics.parent.relative_to(runs).as_posix()
+        if name not in known and (metrics.parent / "timing.json").exists():
+            rows += [{"run": name} | row for row in curve_of(metrics)]
+    write_csv(path, ["run", "step", *CURVES], sorted(rows, key=lambda row: (Path(row["run"]), int(row["step"]))))
     return code
 
 

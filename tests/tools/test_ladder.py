@@ -62,6 +62,23 @@ def test_curve_contains_logged_training_rows(scripts, tmp_path):
     assert [(row["step"], row["q"]) for row in curve] == [(500, "0.33333"), (1000, "2")]
 
 
+def test_curves_of_runs_in_another_folder_stay(scripts, ran, tmp_path, monkeypatch):
+    script, results = scripts("ladder"), tmp_path / "results"
+    monkeypatch.setattr(script, "RESULTS", results)
+    results.mkdir()
+    (results / "README.md").touch()
+    before = "run,step,q,critic_loss,actor_loss,bc_loss\n" + "".join(
+        f"a/finetune-bc,{n},1,2,3,4\n" for n in (500, 1000)
+    )
+    (results / "curves.csv").write_text(before)
+    for _ in range(2):
+        assert script.keep_rows(ran / "runs") == 0
+        kept = (results / "curves.csv").read_text()
+        assert kept.startswith(before), kept
+        rows = list(csv.DictReader(kept.splitlines()))[2:]
+        assert [(row["run"], row["step"]) for row in rows] == [("walker_walk/finetune-td3_bc", "4")]
+
+
 def test_cloning_losses_match_an_agent(scripts, ran, encoder, monkeypatch):
     script, asked = scripts("ladder_policies"), []
 
