@@ -35,7 +35,7 @@ def test_unread_options_are_rejected(settings, reader):
         PretrainConfig.of("smoke", **settings).check()
 
 
-def test_a_whole_number_is_the_setting_that_a_command_line_gives():
+def test_integer_for_a_float_setting_is_recorded_as_a_float():
     settings = [jsonable(flat(FinetuneConfig.of("smoke", alpha=alpha, learning_rate=1))) for alpha in (5, 5.0)]
     assert content_hash(settings[0]) == content_hash(settings[1])
     assert type(settings[0]["updates"]) is int

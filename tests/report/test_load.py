@@ -29,7 +29,7 @@ def test_invalid_runs_are_rejected(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_one_run_twice_in_a_results_folder_is_no_second_seed(tmp_path):
+def test_duplicate_run_in_a_results_folder_is_rejected(tmp_path):
     (run,) = find_results([write_run(tmp_path / "a", "acro", 0, {10: [1.0, 3.0]})])
     write_results(tmp_path / "results", [run, replace(run, id="another")])
     with pytest.raises(UserError, match=f"run another and .*run {run.id}: two runs with the same method"):

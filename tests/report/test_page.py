@@ -213,7 +213,7 @@ def test_report_is_reproducible_from_its_own_folder(tmp_path):
     assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows, "a report in place keeps its rows"
 
 
-def test_a_report_keeps_its_certificates_however_its_folder_is_named(tmp_path, monkeypatch):
+def test_report_of_its_own_folder_keeps_certificates(tmp_path, monkeypatch):
     without_figures(monkeypatch)
     monkeypatch.chdir(tmp_path)
     write_run(tmp_path / "runs/a", "acro", 0, {10: [25.0]})

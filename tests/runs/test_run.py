@@ -57,7 +57,7 @@ def test_only_the_same_run_resumes(tmp_path):
         begin(tmp_path)
 
 
-def test_a_run_from_before_a_setting_resumes_with_the_value_that_it_implied(tmp_path):
+def test_run_without_a_later_setting_resumes_with_its_implied_value(tmp_path):
     @dataclass(frozen=True)
     class Later(Config):
         keep_newest: bool = False

@@ -61,7 +61,7 @@ def test_sweep_jobs_load_plugins_of_the_starting_script(tmp_path, run):
     (record,) = (tmp_path / "runs").rglob("finetune-mine/config.json")
     config = json.loads(record.read_text())
     assert config["plugins"] == {"algorithm mine": "registered by a call"}
-    assert config["command"].startswith("own.py finetune ")
+    assert config["command"].startswith("python own.py finetune ")
     again = run("# changed\n" + GUARD + "main()")
     assert (
         "warning: algorithm mine: 1 sets or runs count, though its code has changed since they began\n" in again.stderr

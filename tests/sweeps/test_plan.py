@@ -114,7 +114,7 @@ def test_folder_names_of_other_runs_are_not_reused(copy):
     assert left(plan(copy)) == []
 
 
-def test_a_narrowed_grid_and_a_changed_one_are_two_plans(tmp_path, monkeypatch):
+def test_narrowed_and_changed_grid_have_separate_plans(tmp_path, monkeypatch):
     monkeypatch.setattr("vd4rl_pomdp.cli.sweeps.carry_out", lambda *_: None)
     (tmp_path / "grid.toml").write_text(GRID)
     for flag in ("--only", "--change"):

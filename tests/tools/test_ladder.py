@@ -62,7 +62,7 @@ def test_curve_contains_logged_training_rows(scripts, tmp_path):
     assert [(row["step"], row["q"]) for row in curve] == [(500, "0.33333"), (1000, "2")]
 
 
-def test_curves_of_runs_in_another_folder_stay(scripts, ran, tmp_path, monkeypatch):
+def test_curves_of_runs_in_other_work_folders_are_kept(scripts, ran, tmp_path, monkeypatch):
     script, results = scripts("ladder"), tmp_path / "results"
     monkeypatch.setattr(script, "RESULTS", results)
     results.mkdir()
