@@ -28,11 +28,12 @@ class LatentForward(StateInverse):
     def forward_ends(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Input and target of the forward model, each (B, T - 1, D), from states (B, T, D); detached where needed."""
 
-    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss_of(
+        self, past: Tensor, future: Tensor, window: Windows, progress: float | Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """The inverse model's loss plus the weighted `forward_loss` over all real transitions (t, t + 1)."""
-        states, _ = self.representations(window)
-        loss, logs = self.loss_of(states, states, window, progress)
-        now, following = self.forward_ends(states)
+        loss, logs = super().loss_of(past, future, window, progress)
+        now, following = self.forward_ends(past)
         predicted = self.forward_model(torch.cat([now, window.action[:, :-1].to(now)], dim=-1))
         error, real = (predicted - following).square().mean(-1), window.real[:, 1:]
         forward_loss = (error * real).sum() / real.sum()

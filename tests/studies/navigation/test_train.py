@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from pretrain.objectives import METHODS, Method
 from pretrain.train import Trainer
 from tests.helpers_data import fake_rows, write_fake_set
 from vd4rl_pomdp.cli.parsing import parse_stage
@@ -12,6 +13,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
+from vd4rl_pomdp.nn.objective import ActionOptions, InverseOptions, StateInverse
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.runs import METHOD_NAMES, OBJECTIVES
 from vd4rl_pomdp.studies.navigation.train import (
@@ -93,6 +95,29 @@ def test_final_averages_do_not_depend_on_log_interval(maze_set, tmp_path):
     found = [results(tmp_path / str(every)) for every in intervals]
     for measure in (("state_error", "training", "online", "all", 0), ("action_loss", "training", "", "all", 0)):
         assert [one[measure] for one in found] == pytest.approx([found[0][measure]] * len(found))
+
+
+class Doubled(StateInverse):
+    """A user's method that overrides `loss`."""
+
+    def loss(self, window, progress):
+        loss, logs = super().loss(window, progress)
+        return 2 * loss, logs | {"loss": 2 * loss.detach()}
+
+
+def test_every_method_trains_its_own_loss_next_to_the_probes(maze_set, tmp_path):
+    with METHODS.isolated():
+        METHODS.register("doubled", Method(Doubled, options=InverseOptions))
+        data = window = None
+        for method in (name for name, one in METHODS.items() if issubclass(one.options, ActionOptions)):
+            config = smoke(maze_set, tmp_path / "run", method=method, action_target="mse")
+            data = data or MazeData(config).on(torch.device("cpu"))
+            window = window or data.windows(torch.tensor([0, 30]))
+            probed = ProbedObjective(data, config)
+            loss, logs = probed.loss(window, 0.0)
+            own, named = probed.objective.loss(window, 0.0)
+            assert {*logs} == {*named, "probe_loss"}, method
+            torch.testing.assert_close(loss - logs["probe_loss"], own)
 
 
 def test_probe_does_not_change_encoder_gradients(maze_set, tmp_path):

@@ -238,7 +238,7 @@ class ProbedObjective(Objective):
         self, window: Windows, progress: float | Tensor
     ) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
         """Loss and logs of one batch, and its estimated states, true states and hidden mask; frames are encoded
-        once."""
+        once, if the method adds nothing to `loss`."""
         past, future = self.objective.representations(window)
         rows = self.data.dataset.rows(window.key)
         supervised = self.config.method in SUPERVISED
@@ -247,7 +247,10 @@ class ProbedObjective(Objective):
         states = (estimate, truth, self.data.hidden[rows])
         if supervised:
             return error, {"loss": error.detach()}, states
-        loss, logs = self.objective.loss_of(past, future, window, progress)
+        if type(self.objective).loss is InverseObjective.loss:
+            loss, logs = self.objective.loss_of(past, future, window, progress)
+        else:  # it trains more than `loss_of` gives, and encodes the frames again
+            loss, logs = self.objective.loss(window, progress)
         return loss + error, logs | {"probe_loss": error.detach()}, states
 
     def after_step(self) -> None:
