@@ -355,7 +355,11 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     (tmp_path / "own").mkdir()
     write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk", "set": "expert"})
     import_set("vd4rl", str(tmp_path / "own"), tmp_path / "small", size=50)
-    assert "images of 84x84 pixels become 50x50 (area means)" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "images of 84x84 pixels become 50x50 (area means)" in told
+    assert "evaluations render walker_walk at 50x50, which gives other pixels than these means" in told
+    import_set("vd4rl", str(tmp_path / "own"), tmp_path / "maze", task="elsewhere", size=50)
+    assert "evaluations" not in capsys.readouterr().err
     frames = rows_of_set(tmp_path / "small")["observation"]
     np.testing.assert_array_equal(
         frames, [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]

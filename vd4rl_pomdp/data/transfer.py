@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
-from vd4rl_pomdp.core.tasks import FRAME_SIZES
+from vd4rl_pomdp.core.tasks import FRAME_SIZES, TASKS, DMCTask
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import PLAN
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
@@ -60,13 +60,17 @@ def import_set(
     """
     refuse_inside(out)
     with _errors_of(source):
-        opened = _resized(FORMATS.named(name).read(source, picture), size)
+        stored = FORMATS.named(name).read(source, picture)
+        opened = _resized(stored, size)
         if not opened.episodes:
             raise UserError("holds no episodes")
     own = next((value for value in opened.record.values() if isinstance(value, str)), name)
     # without a known task, its label (also used in file names) is made from the source's own name
     label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
     _print(opened.notes)
+    if opened.frame_shape != stored.frame_shape and isinstance(TASKS.get(label), DMCTask):
+        means = f"evaluations render {label} at {size}x{size}, which gives other pixels than these means"
+        _print([f"{means}: `vd4rl-pomdp data parity {out}` compares them"])
     settings: dict[str, Any] = {
         "format": name,
         "source": opened.record,
