@@ -149,10 +149,19 @@ def test_invalid_options_classes_are_rejected(registries, kind, options, message
 
 
 @pytest.mark.parametrize(
+    ("kind", "option"),
+    [("method", "seed"), ("frame_encoder", "encoder"), ("corruption", "keep_newest"), ("algorithm", "quality")],
+)
+def test_an_option_that_records_would_leave_out_is_refused(registries, kind, option):
+    options = option_called(option, FrameOptions if kind == "frame_encoder" else Options)
+    with pytest.raises(UserError, match=f"the name of its option '{option}' is taken: choose another"):
+        registries[kind].register("mine", part_with(kind, options))
+
+
+@pytest.mark.parametrize(
     ("kind", "option", "owner"),
     [
         ("method", "steps", "PretrainConfig"),
-        ("method", "seed", "PretrainConfig"),
         ("method", "patch_size", "Patch"),
         ("corruption", "corruption_mode", "CorruptionConfig"),
         ("frame_encoder", "hidden_dim", "GRUOptions"),

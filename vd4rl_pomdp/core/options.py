@@ -204,4 +204,7 @@ def refuse_options(kind: Any, base: type[Options] = Options) -> None:
     if not (isinstance(kind, type) and issubclass(kind, base)):
         public = base.__module__.replace("vd4rl_pomdp.core.", "vd4rl_pomdp.")
         raise UserError(f"its options are {kind!r}: name a dataclass that is derived from {public}.{base.__name__}")
-    flat(kind.fill({}))
+    for name, value in flat(kind.fill({})).items():
+        # records would leave it out, so that runs or encoders with other values would count as the same
+        if name in NO_SETTINGS or name in LABELS or LATER.get(name, value) != value:
+            raise UserError(f"the name of its option {name!r} is taken: choose another")
