@@ -105,7 +105,7 @@ class Doubled(StateInverse):
         return 2 * loss, logs | {"loss": 2 * loss.detach()}
 
 
-def test_every_method_trains_its_own_loss_next_to_the_probes(maze_set, tmp_path):
+def test_every_method_trains_its_own_loss_beside_the_probe(maze_set, tmp_path):
     with METHODS.isolated():
         METHODS.register("doubled", Method(Doubled, options=InverseOptions))
         data = window = None
