@@ -1,6 +1,7 @@
 """Certificates: training, verdicts, and where they are shown."""
 
 import json
+import re
 from html import unescape
 
 import numpy as np
@@ -11,6 +12,7 @@ from tests.helpers_report import describe, without_figures, write_run
 from tests.helpers_stages import contents
 from vd4rl_pomdp.cli import main, studies
 from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, NEEDS_NOT, OPEN, judge
 
@@ -68,6 +70,10 @@ def test_certificate_is_computed_stored_and_shown(states, carried, tmp_path, mon
     assert f"patch: {certificate['verdict']} ({certificate['why']})" in shown.out
     assert f"the certificate is only in {out}" in shown.err
     (states / "certificates.json").rmdir()
+    with owned(states):  # by another certificate of the dataset: written at once, one of them would be lost
+        main(words)
+    shown = capsys.readouterr()
+    assert re.search(f"is in use by .*; the certificate is only in {out}", shown.err)
 
     before, carried[:] = contents(out / MEMORY), []
     main([*words, *POLICIES.split(), "--returns"])

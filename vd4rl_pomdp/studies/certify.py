@@ -38,6 +38,7 @@ from vd4rl_pomdp.report.gates import STATE_SHARE, converged, episodes_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
 from vd4rl_pomdp.runs.files import Row, groups, read_json, write_json
+from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.sweeps.grid import GridCell, load_grid
@@ -124,8 +125,10 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     }
     made = {certificate_id(dataset.fingerprint, hidden): certificate}
     keep_certificates(out, made)
+    place = dataset.path if dataset.path.is_dir() else dataset.path.parent
     try:
-        keep_certificates(dataset.path if dataset.path.is_dir() else dataset.path.parent, made)
+        with owned(place):  # another process may add a certificate at the same time
+            keep_certificates(place, made)
     except UserError as error:  # a shared dataset may be read-only
         print(f"warning: {error}; the certificate is only in {out}", file=sys.stderr)
     return certificate
