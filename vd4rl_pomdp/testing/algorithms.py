@@ -215,12 +215,11 @@ def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
 def farther_than_rounding(
     found: Mapping[str, Tensor],
     single: Callable[[Callable[[Algorithm], Algorithm]], Mapping[str, Tensor]],
-    times: float = 4.0,
 ) -> list[str]:
     """Tensors that differ from a single run's by more than rounding explains, and by how much.
 
-    `single` repeats a single run; its argument modifies the algorithm before the first step. The tolerance is `times`
-    the largest change by three other summation orders or float32's epsilon.
+    `single` repeats a single run; its argument modifies the algorithm before the first step. The tolerance is four
+    times the largest change by three other summation orders or float32's epsilon.
     """
     expected = single(lambda algorithm: algorithm)
     others = [single(lambda algorithm, seed=seed: permuted(algorithm, seed)) for seed in range(3)]  # type: ignore[misc]
@@ -229,7 +228,7 @@ def farther_than_rounding(
     for name, value in expected.items():
         value = value.double()
         digit = torch.finfo(torch.float32).eps * value.abs().max()
-        bound = times * torch.stack([digit, *((other[name].double() - value).abs().max() for other in others)]).max()
+        bound = 4 * torch.stack([digit, *((other[name].double() - value).abs().max() for other in others)]).max()
         apart = (found[name].double() - value).abs().max()
         if not apart <= bound:
             far.append(f"{name} by {apart:.2g}, which rounding explains up to {bound:.2g}")
