@@ -3,10 +3,11 @@
 import contextlib
 import io
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.cli import main, run_to_end
 
 SET, ENCODER, RUN = "walker_walk/expert", "runs/pretrained/encoder", "runs/finetuned"
 PRETRAIN = ["--preset", "smoke", "--steps", "2"]
@@ -43,6 +44,13 @@ def end_of(words: list[str]) -> tuple[int, str]:
         except SystemExit as end:
             return int(end.code or 0), stderr.getvalue()
     return 0, stderr.getvalue()
+
+
+def rejection(words: Sequence[str]) -> str:
+    """Run a command line that must end with exit code 2, and return its error line."""
+    end = run_to_end(words)
+    assert end.code == 2, end
+    return end.line
 
 
 def snapshot(folder: Path) -> dict[Path, tuple[int, int]]:

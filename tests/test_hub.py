@@ -12,6 +12,7 @@ import huggingface_hub
 import pytest
 import yaml
 
+from tests.helpers_bad_input import rejection
 from tests.helpers_data import write_fake_set
 from tests.helpers_hub import TOKEN, Hub, Repo
 from tests.nn.test_encoder import CARD, make
@@ -250,9 +251,8 @@ def test_failed_push_leaves_the_repository_unchanged(hub, encoder, monkeypatch, 
     save_encoder(encoder, make("gru", True), replace(CARD, seed=1))
     before = hub.files(WHERE[ENCODER])
     hub.status = {path: status}
-    with pytest.raises(UserError, match=f"lab/encoder: the Hub refused or did not answer .*{status}") as message:
+    with pytest.raises(UserError, match=f"lab/encoder: the Hub refused or did not answer .*{status}"):
         push(encoder, ENCODER)
-    assert "\n" not in str(message.value)
     assert hub.files(WHERE[ENCODER]) == before
 
 
@@ -273,9 +273,4 @@ def test_hub_commands(hub, encoder, tmp_path, capsys):
     for message in ("downloaded and verified", "already present and verified"):
         main(["hub", "pull", "lab/encoder", new, "--revision", "v1"])
         assert tuple(capsys.readouterr()) == (f"{new}: {message}\n", "")
-    with pytest.raises(SystemExit) as ended:
-        main(["hub", "pull", "lab/nothing", new])
-    assert ended.value.code == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith("error: lab/nothing: the Hub refused")
+    assert rejection(["hub", "pull", "lab/nothing", new]).startswith("error: lab/nothing: the Hub refused")

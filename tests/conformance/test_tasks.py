@@ -162,7 +162,6 @@ def test_unbounded_dm_control_tasks_are_rejected(tasks, tmp_path, task):
         lambda: CorruptedEnv(tasks["unbounded"], CorruptionConfig.of("none")),
         lambda: dmc.replay_rewards("unbounded", np.zeros(4), np.zeros((1, 1))),
     ):
-        with pytest.raises(UserError, match=message) as caught:
+        with pytest.raises(UserError, match=message):
             play()
-        assert "\n" not in str(caught.value)
     assert not (tmp_path / "set").exists()

@@ -58,14 +58,10 @@ def test_buffers_are_reused_only_when_unreferenced():
     assert address in {tensor.data_ptr() for tensor in [buffers.take((2, 3, 84, 84)) for _ in range(2)]}
 
 
-def test_buffers_have_the_requested_shape():
+def test_live_buffers_have_their_shape_and_do_not_share_memory():
     buffers = FrameBuffers()
     shapes = [tuple(buffers.take((count, 3, 84, 84)).shape) for count in (3, 1, 2, 3, 0, 5, 4)]
     assert shapes == [(count, 3, 84, 84) for count in (3, 1, 2, 3, 0, 5, 4)]
-
-
-def test_live_buffers_do_not_share_memory():
-    buffers = FrameBuffers()
     held = [buffers.take((1, 3, 84, 84)).fill_(i) for i in range(9)]
     assert [int(tensor.float().mean()) for tensor in held] == list(range(9))
     assert len({tensor.data_ptr() for tensor in held}) == 9

@@ -90,6 +90,5 @@ def test_physics_of_another_simulator_is_rejected(tmp_path, action_dim, physics)
     if physics:
         with h5py.File(folder / "0_fake.hdf5", "a") as file:
             file["physics"][...] = physics
-    with pytest.raises(UserError, match=r"the episode of row 0 cannot be replayed in walker_walk \(.+\)") as caught:
+    with pytest.raises(UserError, match=r"the episode of row 0 cannot be replayed in walker_walk \(.+\)"):
         check_dataset(folder, tmp_path / "cache")
-    assert "\n" not in str(caught.value)

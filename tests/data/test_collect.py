@@ -214,7 +214,7 @@ def test_action_noise_is_executed_and_recorded(monkeypatch, tmp_path, changes, n
     assert "action_noise" not in read_attributes(quiet[0])
 
 
-def test_action_noise_has_requested_standard_deviation(monkeypatch, tmp_path):
+def test_action_noise_has_requested_standard_deviation(tmp_path):
     job = module._job(config(tmp_path, quality="expert_noisy"), actor(1), 0, 200)
     still = replace(actor(1), weights={k: 0 * v for k, v in actor(1).weights.items()})
     still.weights["log_std.bias"][:] = -20
@@ -229,7 +229,7 @@ def test_noisy_quality_rejects_action_noise_option(tmp_path):
     assert not (tmp_path / "set").exists()
 
 
-def test_unrendered_episodes_equal_rendered_ones(tmp_path, monkeypatch):
+def test_unrendered_episodes_equal_rendered_ones(tmp_path):
     settings = config(tmp_path / "set", quality="medium_replay", episodes=2)
     rendered = [read_shard(path) for path in collect(replace(settings, out=tmp_path / "rendered"), LENGTH)]
     played = list(module.play(settings, LENGTH))

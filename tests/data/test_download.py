@@ -6,6 +6,7 @@ import re
 import huggingface_hub
 import pytest
 
+from tests.helpers_bad_input import rejection
 from tests.helpers_data import write_fake_set
 from tests.helpers_hub import Hub, Repo
 from vd4rl_pomdp.cli import main
@@ -107,23 +108,19 @@ def test_failed_download_keeps_complete_shards(mirror, tmp_path):
     with pytest.raises(UserError, match=r"1_a_expert\.hdf5: has a wrong SHA-256 and was removed; re-run the same"):
         fetch(mirror, tmp_path)
     mirror.damaged, mirror.status = set(), {"1_a_expert": 404}
-    with pytest.raises(
-        UserError, match=r"1_a_expert\.hdf5: cannot be fetched \(.*404.*\); check the network"
-    ) as caught:
+    with pytest.raises(UserError, match=r"1_a_expert\.hdf5: cannot be fetched \(.*404.*\); check the network"):
         fetch(mirror, tmp_path)
-    assert "\n" not in str(caught.value)
     mirror.status = {}
     fetched(mirror)
     assert len(fetch(mirror, tmp_path)) == 2
     assert fetched(mirror) == ["1_a_expert.hdf5"]
 
 
-def test_invalid_names_are_rejected_before_any_request(mirror, tmp_path, capsys):
+def test_invalid_names_are_rejected_before_any_request(mirror, tmp_path):
     for words in (["walker_walk", "foo", "--quality", "expert"], ["walker_walk", "--quality", "expert", "foo"]):
-        with pytest.raises(SystemExit) as end:
-            main(["data", "download", "--out", str(tmp_path), "--endpoint", mirror.endpoint, "--task", *words])
-        assert end.value.code == 2
-        assert "'foo': choose one of" in capsys.readouterr().err
+        assert "'foo': choose one of" in rejection(
+            ["data", "download", "--out", str(tmp_path), "--endpoint", mirror.endpoint, "--task", *words]
+        )
     assert not mirror.requests
     assert not list(tmp_path.iterdir())
 
@@ -149,8 +146,6 @@ def test_token_is_sent_only_to_configured_hub(mirror, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("walker_run", "expert"), "unknown task of published sets 'walker_run': choose one of cheetah_run"),
-        (("walker_walk", "best"), "unknown quality 'best': choose one of random"),
         (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is not an address"),
         (("walker_walk", "expert", "http://["), r"endpoint 'http://\[' is not an address"),
     ],

@@ -11,6 +11,7 @@ import pytest
 
 from finetune.train import finetune
 from pretrain.train import pretrain
+from tests.helpers_bad_input import rejection
 from tests.helpers_data import assert_equal_rows, fake_episode, fake_frame, fake_reward, rows_of_set, write_fake_set
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.cli import main
@@ -218,21 +219,17 @@ def test_minari_relative_paths_and_damaged_metadata(minari, tmp_path, monkeypatc
         *(({key: np.zeros((n, *of), kind) for key, of, kind in KEYS}, "has no step") for n in (0, 1)),
     ],
 )
-def test_import_of_damaged_episode_leaves_nothing(changed, message, tmp_path, capsys):
+def test_import_of_damaged_episode_leaves_nothing(changed, message, tmp_path):
     export_set("vd4rl_npz", write_fake_set(tmp_path / "own", [5, 5]), tmp_path / "npz")
     with np.load(file := tmp_path / "npz" / "000001-5.npz") as stored:
         np.savez(file, **(dict(stored) | changed))
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as ended:
-        main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "new" / "set")])
-    assert ended.value.code == 2
-    (line,) = (line for line in capsys.readouterr().err.splitlines() if not line.startswith("import: "))
+    words = ["data", "import", "vd4rl_npz", str(tmp_path / "npz")]
+    line = rejection([*words, str(tmp_path / "new" / "set")])
     assert "npz: episode 1: " in line
     assert message in line
     assert not (tmp_path / "new").exists()
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SystemExit):
-        main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "empty")])
+    rejection([*words, str(tmp_path / "empty")])
     assert list((tmp_path / "empty").iterdir()) == [], "the user's existing folder stays"
 
 

@@ -166,9 +166,8 @@ def test_environment_is_made_by_id_and_arguments():
     ],
 )
 def test_unsupported_environments_are_rejected(arguments, message):
-    with pytest.raises(UserError, match=message) as caught:
+    with pytest.raises(UserError, match=message):
         play(GymnasiumTask(Counter, arguments), 0)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("place", ["reset", "step", "render"])
@@ -180,11 +179,8 @@ def test_late_missing_dependency_is_reported(place):
         raise gymnasium.error.DependencyNotInstalled("pygame is not installed,\nrun `pip install pygame`")
 
     setattr(Needy, place, refuse)
-    with pytest.raises(
-        UserError, match=r"Needy cannot .* \(pygame is not installed, run `pip .* install what"
-    ) as caught:
+    with pytest.raises(UserError, match=r"Needy cannot .* \(pygame is not installed, run `pip .* install what"):
         play(GymnasiumTask(Needy), 1)
-    assert "\n" not in str(caught.value)
 
 
 def test_termination_and_truncation_are_distinguished():
@@ -224,11 +220,8 @@ class Failing(Counter):
 
 def test_environment_without_seed_is_rejected():
     env = make_env(GymnasiumTask(Seedless))
-    with pytest.raises(
-        UserError, match=r"Seedless cannot be reset with a seed \(.* 'seed'\): give it Gymnasium's"
-    ) as caught:
+    with pytest.raises(UserError, match=r"Seedless cannot be reset with a seed \(.* 'seed'\): give it Gymnasium's"):
         env.reset(0)
-    assert "\n" not in str(caught.value)
     with pytest.raises(TypeError, match="has no len"):  # the environment's own defects are not converted
         make_env(GymnasiumTask(Failing)).reset(0)
 

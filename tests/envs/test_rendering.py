@@ -29,9 +29,8 @@ def test_incompatible_dm_control_is_reported(task, monkeypatch):
         raise AttributeError("'MjModel' object has no attribute 'flex_evpair'")  # as of 1.0.44 with mujoco 3.17.0
 
     monkeypatch.setattr("dm_control.mujoco.Physics.from_xml_string", load)
-    with pytest.raises(UserError, match=r"is incompatible with mujoco .*flex_evpair.*dm-control==1\.0\.44") as caught:
+    with pytest.raises(UserError, match=r"is incompatible with mujoco .*flex_evpair.*dm-control==1\.0\.44"):
         make_env(TASKS[task])
-    assert "\n" not in str(caught.value)
 
 
 WITHOUT = """

@@ -11,6 +11,7 @@ import torch
 
 from finetune import evaluation
 from finetune.evaluation import EVALUATION_SEED, Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
+from tests.helpers_bad_input import rejection
 from tests.nn.test_encoder import CARD
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -182,7 +183,7 @@ def test_evaluate_uses_training_corruption_and_none_by_default(world, run, data,
     assert (only[0], only[1]["episodes"]) == ("none", written[1:])
 
 
-def test_evaluate_accepts_corruption_options(world, run, tmp_path, capsys, monkeypatch):
+def test_evaluate_accepts_corruption_options(world, run, tmp_path, monkeypatch):
     """The run was trained under patch+zero_frames, patches of 16 pixels."""
     jobs, play_all = [], evaluation.evaluate
     monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or play_all(given, workers))
@@ -208,17 +209,12 @@ def test_evaluate_accepts_corruption_options(world, run, tmp_path, capsys, monke
         ("patch --patch-size 0", "--patch-size is 0"),
         ("truncate --kept middle", "--kept"),
     ):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main(["evaluate", str(run), "--corruption", *words.split()])
-        assert end.value.code == 2
-        assert message in (error := capsys.readouterr().err)
-        assert error.count("\n") == 1
+        assert message in rejection(["evaluate", str(run), "--corruption", *words.split()])
     with pytest.raises(UserError, match="--patch-sise is not read by the corruption patch"):
         evaluate_run(run, "patch", 1, 1, patch_sise=3)
 
 
-def test_keep_stores_rows_under_another_corruption_once(world, run, tmp_path, capsys, monkeypatch):
+def test_keep_stores_rows_under_another_corruption_once(world, run, tmp_path, monkeypatch):
     before = read_episodes(run / "episodes.csv")
     words = ["evaluate", str(run), "--episodes", "2", "--workers", "1", "--keep"]
     for option in ([], ["--patch-size", "24"]):
@@ -230,10 +226,7 @@ def test_keep_stores_rows_under_another_corruption_once(world, run, tmp_path, ca
         (["--corruption", "patch"], "episodes.csv already has 2 episodes under patch; leave --keep out"),
         ([], "--keep needs --corruption"),
     ):
-        with pytest.raises(SystemExit) as end:
-            main([*words, *wrong])
-        assert end.value.code == 2
-        assert message in capsys.readouterr().err
+        assert message in rejection([*words, *wrong])
     found = tables.elsewhere(episodes_frame(load_runs([run])))
     assert found["evaluated_under"].tolist() == ["patch", "patch, patch_size 24"]
     assert found["score"].tolist() == pytest.approx([1.175, 1.175])
@@ -244,8 +237,7 @@ def test_keep_stores_rows_under_another_corruption_once(world, run, tmp_path, ca
         return play_all(*jobs)
 
     monkeypatch.setattr(evaluation, "evaluate", meanwhile)
-    with pytest.raises(SystemExit):
-        main([*words, "--corruption", "truncate"])
+    rejection([*words, "--corruption", "truncate"])
     assert [row["evaluated_under"] for row in read_episodes(run / "episodes.csv")].count("truncate") == 1
     (run / "timing.json").unlink()
     with pytest.raises(UserError, match="is not finished"):

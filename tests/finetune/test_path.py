@@ -14,7 +14,6 @@ from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.policies import load_actor
 
@@ -37,11 +36,6 @@ def walked(tmp_path):
     attributes = {"task": "walker_walk", "set": "expert", "actor_sha256": actor.sha256}
     write_shard(folder / "0_walker_walk_expert.hdf5", rows, attributes)
     return folder, np.stack([step.state for step in steps]), actor
-
-
-def test_observed_states_match_the_environment(walked):
-    folder, states, _ = walked
-    np.testing.assert_allclose(observed_states(TASKS["walker_walk"], open_dataset(folder).physics), states, atol=1e-6)
 
 
 def test_path_error_compares_with_actor_at_the_same_row(walked):

@@ -125,14 +125,7 @@ def test_state_encoder_reads_pose_and_velocity(with_states, data, tmp_path):
         run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
-def test_missing_gpu_leaves_no_run(data, encoder, tmp_path):
-    """Other wrong values are in `test_bad_flags.py`."""
-    with pytest.raises(UserError, match="no such GPU"):
-        run_finetune(smoke_finetune(encoder, data, tmp_path / "out", device="cuda:99"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_datasets_unfit_for_the_encoder_are_rejected(encoder, data, tmp_path):
+def test_unfit_datasets_and_missing_gpus_leave_no_run(encoder, data, tmp_path):
     other = write_fake_set(tmp_path / "humanoid_walk" / "expert", [20, 20], action_dim=21)
     single = write_fake_set(tmp_path / "single" / "walker_walk", [1, 1])
     for given, message in ((other, "6 action dimensions"), (single, "holds no transition")):
@@ -144,6 +137,8 @@ def test_datasets_unfit_for_the_encoder_are_rejected(encoder, data, tmp_path):
     (tmp_path / "small" / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match=r"small: this encoder reads images of 64x64 pixels, the dataset has 84x84"):
         run_finetune(smoke_finetune(tmp_path / "small", data, tmp_path / "out"))
+    with pytest.raises(UserError, match="no such GPU"):
+        run_finetune(smoke_finetune(encoder, data, tmp_path / "out", device="cuda:99"))
     assert not (tmp_path / "out").exists()
 
 

@@ -128,9 +128,8 @@ def test_invalid_encoder_cards_are_rejected(tmp_path, part, field, value):
     config = json.loads((tmp_path / "config.json").read_text())
     config[part][field] = value
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match=r"(describes no|not an) encoder") as caught:
+    with pytest.raises(UserError, match=r"(describes no|not an) encoder"):
         load_encoder(tmp_path)
-    assert "\n" not in str(caught.value)
     (tmp_path / "config.json").write_bytes(b"\x80\x04")
     with pytest.raises(UserError, match="not an encoder folder"):
         load_encoder(tmp_path)

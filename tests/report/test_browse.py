@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.helpers_bad_input import rejection
 from tests.helpers_data import fake_rows
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
@@ -87,17 +88,15 @@ def _data(page: str) -> tuple[str, str]:
     return re.search(r'id="content">(.*?)</script>', page)[1], ""
 
 
-def test_viewer_overwrites_only_its_own_page(tmp_path, capsys):
+def test_viewer_overwrites_only_its_own_page(tmp_path):
     folder, out = noisy_set(tmp_path / "walker_walk" / "expert", [5], 16), tmp_path / "view.html"
     for corruption in ("patch", "none"):
         main(["data", "view", str(folder), "--out", str(out), "--corruption", corruption])
     assert 'id="on"' not in out.read_text(), "no switch without corruption"
     out.write_text("mine")
     for place in (out, tmp_path, folder / "view.html"):
-        with pytest.raises(SystemExit) as ended:
-            main(["data", "view", str(folder), "--out", str(place)])
-        assert ended.value.code == 2
+        rejection(["data", "view", str(folder), "--out", str(place)])
     assert out.read_text() == "mine"
-    with pytest.raises(SystemExit):
-        main(["data", "view", str(folder), "--out", str(tmp_path / "new.html"), "--patch-size", "17"])
-    assert "patch size 17 exceeds the image (16x16)" in capsys.readouterr().err
+    assert "patch size 17 exceeds the image (16x16)" in rejection(
+        ["data", "view", str(folder), "--out", str(tmp_path / "new.html"), "--patch-size", "17"]
+    )

@@ -226,6 +226,9 @@ def test_undecided_settings_are_not_ranked(tmp_path):
     assert text.index("undecided at this budget: state returns") < text.index("Final scores")
     ranked = write_report([grid(tmp_path / "good", GOOD)], tmp_path / "other")
     assert methods(ranked.summary)[0] == "mik+a"
+    for algorithm in ("td3_bc", "iql"):
+        grid(tmp_path / "both", GOOD | {("acro", "none"): (9, 9)}, algorithm=algorithm)
+    assert methods(write_report([tmp_path / "both"], tmp_path / "last").summary)[:3] == ["acro", "acro", "mik+a"]
 
 
 def test_gates_are_separate_per_algorithm(tmp_path, capsys):
@@ -240,10 +243,3 @@ def test_gates_are_separate_per_algorithm(tmp_path, capsys):
     for shown in (re.sub(r"</td>\s*<td>", ": ", report.page.read_text()), " ".join(capsys.readouterr().out.split())):
         assert "walker_walk expert, patch, iql: undecided at this budget: acro under none" in shown
         assert "walker_walk expert, patch: discriminates" in shown
-
-
-def test_settings_undecided_for_all_algorithms_are_not_ranked(tmp_path):
-    for algorithm in ("td3_bc", "iql"):
-        grid(tmp_path / "runs", GOOD | {("acro", "none"): (9, 9)}, algorithm=algorithm)
-    summary = write_report([tmp_path / "runs"], tmp_path / "out").summary
-    assert methods(summary)[:3] == ["acro", "acro", "mik+a"]

@@ -166,15 +166,12 @@ def by_set(tmp_path, budgets):
     return tmp_path / "runs"
 
 
-def test_budgets_per_set_make_no_variants(tmp_path):
+def test_budgets_make_variants_only_if_they_differ_within_a_set(tmp_path):
     sets = {"walker_walk expert": 20, "cheetah_run expert": 60, "cheetah_run medium": 20}
-    runs = by_set(tmp_path, {(method, name): sets[name] for method in ("acro", "mik+a") for name in sets})
+    runs = by_set(tmp_path / "sets", {(method, name): sets[name] for method in ("acro", "mik+a") for name in sets})
     assert pooled(runs) == {"acro": 3, "mik+a": 3}
-
-
-def test_budgets_of_one_method_make_variants(tmp_path):
     expert, medium = "walker_walk expert", "walker_walk medium"
-    runs = by_set(tmp_path, {("acro", expert): 20, ("acro", medium): 60, ("mik+a", medium): 20})
+    runs = by_set(tmp_path / "methods", {("acro", expert): 20, ("acro", medium): 60, ("mik+a", medium): 20})
     assert pooled(runs) == {"acro, updates 20": 1, "acro, updates 60": 1, "mik+a": 1}
 
 

@@ -16,6 +16,7 @@ import pytest
 from rich.console import Console
 
 import pretrain.objectives
+from tests.helpers_bad_input import rejection
 from tests.helpers_report import describe, grid, pretraining, without_figures, write_run, write_seeds
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -173,7 +174,7 @@ def test_report_of_unfinished_runs_only(tmp_path, drawn):
     assert "0 finished runs, 1 unfinished" in page.read_text()
 
 
-def test_report_overwrites_only_earlier_reports(tmp_path, capsys):
+def test_report_overwrites_only_earlier_reports(tmp_path):
     for seed in (0, 1):
         write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [25.0]})
     write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
@@ -185,10 +186,7 @@ def test_report_overwrites_only_earlier_reports(tmp_path, capsys):
 
     before = files()
     for out in ("runs", "runs/0", "runs/0/report", "notes"):
-        with pytest.raises(SystemExit) as end:
-            main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / out)])
-        assert end.value.code == 2
-        assert "choose another" in capsys.readouterr().err
+        assert "choose another" in rejection(["report", str(tmp_path / "runs"), "--out", str(tmp_path / out)])
         assert files() == before
     write_report([tmp_path / "runs"], tmp_path / "out")
     first = {p.name for p in (tmp_path / "out").iterdir()}

@@ -9,6 +9,7 @@ import h5py
 import pytest
 from PIL import Image
 
+from tests.helpers_bad_input import rejection
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -371,9 +372,9 @@ def test_user_defined_quality_is_used_if_present(tmp_path, capsys, own_cache, qu
     text = GRID.partition("[finetune]")[0].replace('"expert"', quality) + "method = 'random'"
     (tmp_path / "grid.toml").write_text(text)
     words = [str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]
-    with pytest.raises(SystemExit, match="2"):
-        main(["sweep", "run", *words])
-    assert f"{name}: holds no dataset, and the quality '{name}' cannot be collected" in capsys.readouterr().err
+    assert f"{name}: holds no dataset, and the quality '{name}' cannot be collected" in rejection(
+        ["sweep", "run", *words]
+    )
     write_fake_set(tmp_path / "out" / "data" / "walker_walk" / name, [20, 25, 30])
     main(["sweep", "run", *words])
     assert capsys.readouterr().out == "all 2 jobs are finished\n"

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from finetune.train import finetune
+from tests.helpers_bad_input import rejection
 from tests.helpers_stages import CutError, cut_at, smoke_finetune
 from tests.runs.results.test_results import COMMITTED, whole_run
 from vd4rl_pomdp.cli import main
@@ -162,15 +163,13 @@ def test_verify_replays_an_episode_exactly(data, encoder, tmp_path, capsys):
     assert f"replays to a return of {row['return']}" in capsys.readouterr().out
     path = results / "episodes.csv"
     path.write_text(path.read_text().replace(f",{row['return']},4,", f",{row['return'] + 1},4,"))
-    with pytest.raises(SystemExit):
-        main([*words, str(run)])
-    err = capsys.readouterr().err
-    assert f"replays to return {row['return']} where it says {row['return'] + 1}; the row was made with mujoco" in err
-    assert "another renderer" in err.partition(", this is ")[0]
+    line = rejection([*words, str(run)])
+    assert f"replays to return {row['return']} where it says {row['return'] + 1}; the row was made with mujoco" in line
+    assert "another renderer" in line.partition(", this is ")[0]
     add_results([tmp_path / "other"], tmp_path / "without")
-    with pytest.raises(SystemExit):
-        main(["results", "verify", str(tmp_path / "without"), "--replay", str(run)])
-    assert "has no rows in the results folder; name a run that has" in capsys.readouterr().err
+    assert "has no rows in the results folder; name a run that has" in rejection(
+        ["results", "verify", str(tmp_path / "without"), "--replay", str(run)]
+    )
 
 
 @pytest.mark.parametrize("critic", [{"value": "much"}, {"moved": True}, {"moved": float("nan")}, {"valu": 1.0}, [1.0]])

@@ -128,9 +128,8 @@ def test_only_images_of_the_pool_are_read(tmp_path, monkeypatch):
 )
 def test_unusable_image_folders_are_rejected(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(UserError, match=message) as caught:
+    with pytest.raises(UserError, match=message):
         load_pool(str(tmp_path), 0)
-    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_textures_have_the_spectrum_of_natural_images():

@@ -193,7 +193,7 @@ def test_seeds_with_different_settings_are_rejected(tmp_path, file, changes, nam
         loaded(tmp_path / "runs")
 
 
-def test_report_shows_missing_and_unfinished_runs(runs, tmp_path, monkeypatch):
+def test_report_shows_missing_and_unfinished_runs(runs, tmp_path):
     for method in OBJECTIVES:
         for seed in (0, 1, 2)[: 2 if method == "mik" else 3]:
             write_run(tmp_path / "runs", Condition("three_curtains", method), seed, 10.0 + seed)

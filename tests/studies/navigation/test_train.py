@@ -227,9 +227,8 @@ def test_exogenous_noise_is_added_to_observations(maze_set, tmp_path):
     ],
 )
 def test_invalid_navigation_settings_are_rejected(maze_set, tmp_path, changes, message):
-    with pytest.raises(UserError, match=message) as caught:
+    with pytest.raises(UserError, match=message):
         train(smoke(maze_set, tmp_path / "run", **changes))
-    assert len(str(caught.value).splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 

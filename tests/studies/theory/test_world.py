@@ -41,7 +41,6 @@ def test_invalid_worlds_are_rejected(changes, message):
     with pytest.raises(UserError, match=message) as error:
         small(**changes)
     assert "small" in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def brute_force(world, rows):
