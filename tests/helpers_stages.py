@@ -1,10 +1,12 @@
 """The stages at their smallest size, interruptions, and the contents of run folders."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 import finetune.config
@@ -55,8 +57,8 @@ class CutError(Exception):
     pass
 
 
-def cut_at(monkeypatch, number: int) -> None:
-    """Raise in place of writing the `number`-th checkpoint."""
+def run_until_cut(monkeypatch, number: int, run: Callable[..., object], *configs: object) -> None:
+    """Run a stage, and raise in place of writing its `number`-th checkpoint."""
     calls, add = [], Checkpoints.add
 
     def cut(self, *arguments):
@@ -65,7 +67,10 @@ def cut_at(monkeypatch, number: int) -> None:
             raise CutError
         add(self, *arguments)
 
-    monkeypatch.setattr(Checkpoints, "add", cut)
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "add", cut)
+        with pytest.raises(CutError):
+            run(*configs)
 
 
 def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.PretrainConfig:

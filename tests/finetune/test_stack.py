@@ -21,7 +21,7 @@ from finetune.train import finetune, finetune_all
 from finetune.trainer import FinetuneTrainer
 from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import CutError, cut_at, smoke_finetune, smoke_pretrain
+from tests.helpers_stages import run_until_cut, smoke_finetune, smoke_pretrain
 from tests.recording import record, replays
 from vd4rl_pomdp.cli import main, run_to_end
 from vd4rl_pomdp.core.options import NO_OPTIONS
@@ -131,16 +131,12 @@ def test_stacked_runs_resume_alone_or_in_another_stack(encoder, data, tmp_path, 
     configs = {name: smoke_finetune(encoder, data, tmp_path / name, **BRIEF, seed=seed) for name, seed in SEEDS.items()}
     for config in list(configs.values())[3:]:
         finetune(config)
-    with monkeypatch.context() as patch:
-        cut_at(patch, 4)  # after the first member's second checkpoint
-        with pytest.raises(CutError):
-            finetune_all([configs["a"], configs["b"], configs["c"]])
+    # after the first member's second checkpoint
+    run_until_cut(monkeypatch, 4, finetune_all, [configs["a"], configs["b"], configs["c"]])
     steps = {name: {int(p.stem) for p in (tmp_path / name / "checkpoints").glob("*.pt")} for name in ("a", "b", "c")}
     assert steps == {"a": {4}, "b": {4}, "c": {4}}
-    with monkeypatch.context() as patch:
-        cut_at(patch, 2)
-        with pytest.raises(CutError):
-            finetune(configs["a"])  # alone, up to the evaluation at step 6
+    # alone, up to the evaluation at step 6
+    run_until_cut(monkeypatch, 2, finetune, configs["a"])
     made = []
     with monkeypatch.context() as patch:
         call = train.Updates.__call__
@@ -307,10 +303,7 @@ def test_replayed_runs_equal_eager_runs(encoders, data, tmp_path, monkeypatch, c
     for folder, capture in (("run", None), ("replayed", record)):
         replays(monkeypatch, train, end_to_end, td3_bc, bc, capture=capture)
         config = smoke_finetune(encoders[method], data, tmp_path / folder, **changes)
-        with monkeypatch.context() as patch:
-            cut_at(patch, 4)
-            with pytest.raises(CutError):
-                finetune(config)
+        run_until_cut(monkeypatch, 4, finetune, config)
         finetune(config)
     assert "warning" not in capsys.readouterr().err
     same_but_for_rounding(tmp_path / "run", tmp_path / "replayed")

@@ -18,7 +18,7 @@ from finetune.trainer import RESULTS
 from pretrain.train import pretrain as run_pretrain
 from tests.finetune.conftest import BRIEF
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import CutError, contents, cut_at, smoke_finetune, smoke_pretrain
+from tests.helpers_stages import CutError, contents, run_until_cut, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
@@ -35,10 +35,7 @@ def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **
     """Fine-tune uninterrupted, and again with a cut at the second checkpoint; assert equality; return the first run."""
     whole = run_finetune(smoke_finetune(encoder, data, out / "whole", **changes))
     cut = smoke_finetune(encoder, data, out / "cut", **changes)
-    with monkeypatch.context() as patch:
-        cut_at(patch, 2)
-        with pytest.raises(CutError):
-            run_finetune(cut)
+    run_until_cut(monkeypatch, 2, run_finetune, cut)
     run_finetune(cut)
     assert contents(out / "cut") == contents(whole.path)
     return whole.path

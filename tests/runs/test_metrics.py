@@ -21,7 +21,7 @@ from wandb.proto.wandb_internal_pb2 import Record
 
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
-from tests.helpers_stages import CutError, contents, cut_at, smoke_finetune, smoke_pretrain
+from tests.helpers_stages import contents, run_until_cut, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.metrics import Means, MetricsLog, mirrors_of, read_metrics, wandb_names
 from vd4rl_pomdp.runs.run import RunFolder
@@ -138,10 +138,8 @@ def assert_all_mirrored(run: Path) -> list[dict[str, float]]:
 @pytest.mark.usefixtures("own_cache")
 def test_trackers_get_config_and_all_rows_of_a_resumed_run(encoder, data, tmp_path, monkeypatch):
     changes = FINETUNE | {"wandb": "offline", "tensorboard": True}
-    with monkeypatch.context() as patch:
-        cut_at(patch, 2)
-        with pytest.raises(CutError):
-            run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))  # tracked only after resuming
+    # tracked only after resuming
+    run_until_cut(monkeypatch, 2, run_finetune, smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes)).path
     first = next(record.run for record in wandb_records(run) if record.HasField("run"))
     assert first.run_id == (run / "wandb" / "id").read_text()

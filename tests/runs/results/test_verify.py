@@ -9,7 +9,7 @@ import pytest
 
 from finetune.train import finetune
 from tests.helpers_bad_input import rejection
-from tests.helpers_stages import CutError, cut_at, smoke_finetune
+from tests.helpers_stages import run_until_cut, smoke_finetune
 from tests.runs.results.test_results import COMMITTED, whole_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -139,10 +139,7 @@ def test_verify_finds_manual_edits(data, encoder, tmp_path):
 
 
 def test_changeable_settings_are_recorded_as_of_the_end(data, encoder, tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        cut_at(patch, 2)
-        with pytest.raises(CutError):
-            finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4))
+    run_until_cut(monkeypatch, 2, finetune, smoke_finetune(encoder, data, tmp_path / "run", eval_length=4))
     run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=4, eval_clean=False, log_every=5)).path
     add_results([run], tmp_path / "results")
     (added,) = read_results(tmp_path / "results")
