@@ -43,7 +43,7 @@ NOT_RUN = {
     "ray start": "starts a cluster; tests/sweeps has one of its own",
     "timeout": "tests/sweeps ends sweeps by its signal",
     "nvidia-cuda-mps-control": "needs a GPU; results/gpu was measured with it",
-    **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
+    **{f"python {file}": "test_documented_plugins and test_documented_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     **dict.fromkeys(
         ("vd4rl-pomdp data import", "vd4rl-pomdp data export"), "need sets of others; data/test_formats makes some"

@@ -1,4 +1,4 @@
-"""The documentation's examples of user-defined plug-ins are executed; `test_own_task.py` covers tasks."""
+"""The documentation's examples of user-defined plug-ins are executed; `test_documented_task.py` covers tasks."""
 
 import csv
 import json
@@ -62,7 +62,7 @@ def test_documented_plugins_run_in_all_stages_and_are_recorded(load, tmp_path, m
     common = f"--preset smoke --data {data}"
     main(f"pretrain {first} {common} --out {runs}/pretrain".split())
     finetune = f"finetune {second} --encoder {runs}/pretrain/encoder {common} --out {runs}/finetune --eval-episodes 2"
-    main(f"{finetune} --workers 1".split())  # test_own_task.py covers plug-ins in worker processes
+    main(f"{finetune} --workers 1".split())  # test_documented_task.py covers plug-ins in worker processes
     write_report([runs], tmp_path / "report")
     records = {stage: json.loads((runs / stage / "config.json").read_text()) for stage in ("pretrain", "finetune")}
     for stage in USED_IN[kind]:
