@@ -10,7 +10,7 @@ from vd4rl_pomdp.runs.files import flatten
 
 
 @pytest.fixture
-def here(monkeypatch):
+def in_process(monkeypatch):
     """Run measurements in this process instead of subprocesses."""
 
     def apart(function, *arguments, count=1, **environment):
@@ -22,7 +22,7 @@ def here(monkeypatch):
     monkeypatch.setattr(gpu, "_BETWEEN_WAITS", 1)
 
 
-def test_gpu_benchmark_runs_on_a_cpu(here, capsys):
+def test_gpu_benchmark_runs_on_a_cpu(in_process, capsys):
     main(["bench", "--gpu", "--quick", "--device", "cpu", "--json"])
     results = flatten(json.loads(capsys.readouterr().out))
     assert [name for name in results if name.endswith("failed")] == []
@@ -33,7 +33,7 @@ def test_gpu_benchmark_runs_on_a_cpu(here, capsys):
     assert "jax" in results["td3_bc.jax"] or "no GPU" in results["td3_bc.jax"]
 
 
-def test_failed_measurement_does_not_stop_the_others(here, monkeypatch, capsys):
+def test_failed_measurement_does_not_stop_the_others(in_process, monkeypatch, capsys):
     def fails(*_):
         raise RuntimeError("capture failed: not permitted")
 

@@ -18,21 +18,21 @@ def roll(env, seed, count, action_seed=0):
 
 
 @pytest.fixture(scope="module", params=TASKS)
-def blind(request):
+def unrendered(request):
     return DMCEnv(TASKS[request.param], size=None)
 
 
-def test_observed_states_are_recovered_from_physics(blind):
-    rows, _ = roll(blind, 3, 20)
-    found = observed_states(blind.task, np.stack([row.physics for row in rows]))
+def test_observed_states_are_recovered_from_physics(unrendered):
+    rows, _ = roll(unrendered, 3, 20)
+    found = observed_states(unrendered.task, np.stack([row.physics for row in rows]))
     np.testing.assert_allclose(found, np.stack([row.state for row in rows]), atol=1e-5)
 
 
-def test_dmc_action_repeat_sums_rewards(blind):
-    start = blind.reset(0).physics
-    action = np.full(blind.action_dim, 0.5, np.float32)
-    row = blind.step(action)
-    by_hand = DMCEnv(blind.task, size=None)
+def test_dmc_action_repeat_sums_rewards(unrendered):
+    start = unrendered.reset(0).physics
+    action = np.full(unrendered.action_dim, 0.5, np.float32)
+    row = unrendered.step(action)
+    by_hand = DMCEnv(unrendered.task, size=None)
     by_hand.reset(0)
     steps = [by_hand.simulator.step(action) for _ in range(2)]
     assert row.reward == steps[0].reward + steps[1].reward

@@ -22,7 +22,7 @@ ROWS = 12
 
 
 @pytest.fixture
-def walked(tmp_path):
+def expert_episodes(tmp_path):
     """Two episodes with the expert's physics; frames and actions are fake."""
     env, actor = make_env(TASKS["walker_walk"], size=None, length=ROWS - 1), load_actor("walker_walk", "expert")
     steps, rng = [], np.random.default_rng(0)
@@ -31,15 +31,15 @@ def walked(tmp_path):
         while not steps[-1].last:
             steps.append(env.step(actor.act(steps[-1].state, rng)))
     rows = fake_rows([ROWS, ROWS]) | {"physics": np.stack([step.physics for step in steps])}
-    folder = tmp_path / "walker_walk" / "walked"
+    folder = tmp_path / "walker_walk" / "expert_episodes"
     folder.mkdir(parents=True)
     attributes = {"task": "walker_walk", "set": "expert", "actor_sha256": actor.sha256}
     write_shard(folder / "0_walker_walk_expert.hdf5", rows, attributes)
     return folder, np.stack([step.state for step in steps]), actor
 
 
-def test_path_error_compares_with_actor_at_the_same_row(walked):
-    folder, states, actor = walked
+def test_path_error_compares_with_actor_at_the_same_row(expert_episodes):
+    folder, states, actor = expert_episodes
     shown = torch.from_numpy(np.stack([actor.act(state) for state in states]))
     path = open_dataset(folder), actor, lambda number: shown[number * ROWS : (number + 1) * ROWS]
     assert path_error(*path, lambda z: z) == pytest.approx(0, abs=1e-10)
@@ -47,8 +47,8 @@ def test_path_error_compares_with_actor_at_the_same_row(walked):
     assert path_error(*path, lambda z: z.roll(1, 0)) > 0.01, "the rows differ"
 
 
-def test_path_error_ignores_episodes_of_one_row(walked, monkeypatch):
-    folder, states, actor = walked
+def test_path_error_ignores_episodes_of_one_row(expert_episodes, monkeypatch):
+    folder, states, actor = expert_episodes
     dataset = open_dataset(folder)
     ends = torch.tensor([ROWS, ROWS + 1, 2 * ROWS])
     monkeypatch.setattr(dataset, "episode_start", torch.tensor([0, ROWS, ROWS + 1]))
@@ -59,9 +59,9 @@ def test_path_error_ignores_episodes_of_one_row(walked, monkeypatch):
 
 
 @pytest.mark.parametrize("views", [1, 0])
-def test_run_stores_path_error_and_action_errors(walked, encoder, tmp_path, monkeypatch, views):
+def test_run_stores_path_error_and_action_errors(expert_episodes, encoder, tmp_path, monkeypatch, views):
     monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
-    folder, _, actor = walked
+    folder, _, actor = expert_episodes
     config = smoke_finetune(encoder, folder, tmp_path / "run", views=views, **BRIEF)
     run = finetune(config).path
     reference = Reference.read(run)

@@ -28,7 +28,7 @@ def newest(kept: Checkpoints) -> dict[str, Any]:
 
 
 @pytest.fixture
-def two(tmp_path) -> Checkpoints:
+def checkpoints(tmp_path) -> Checkpoints:
     """A run with checkpoints 1 and 2."""
     kept = Checkpoints(tmp_path)
     for step in (1, 2):
@@ -56,43 +56,43 @@ def test_pack_and_unpack_nested_state():
         pack({"noise": [np.float64(1.0)]})
 
 
-def test_two_newest_checkpoints_are_kept(two, tmp_path):
-    assert two.restore(lambda state: None) == 1.0
-    two.add(13, at(13), 2.0)
+def test_two_newest_checkpoints_are_kept(checkpoints, tmp_path):
+    assert checkpoints.restore(lambda state: None) == 1.0
+    checkpoints.add(13, at(13), 2.0)
     assert names(tmp_path) == ["13.pt", "2.pt"]
-    two.prune(1)
+    checkpoints.prune(1)
     assert names(tmp_path) == ["13.pt"]
-    assert newest(two)["step"] == 13
+    assert newest(checkpoints)["step"] == 13
     assert Checkpoints(tmp_path / "new").restore(lambda state: None) is None
 
 
 @pytest.mark.parametrize("damage", ["cut", "bit", "empty"])
-def test_damaged_checkpoint_falls_back_to_previous_one(two, tmp_path, capsys, damage):
+def test_damaged_checkpoint_falls_back_to_previous_one(checkpoints, tmp_path, capsys, damage):
     path = tmp_path / "checkpoints" / "2.pt"
     content = path.read_bytes()
     place = content.index(at(2)["weights"].numpy().tobytes())
     flipped = content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
     path.write_bytes({"cut": content[:-100], "bit": flipped, "empty": b""}[damage])
-    assert newest(two)["step"] == 1
+    assert newest(checkpoints)["step"] == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"warning: {path}: is damaged")
-    two.add(2, at(2), 1.0)
-    assert newest(two)["step"] == 2
+    checkpoints.add(2, at(2), 1.0)
+    assert newest(checkpoints)["step"] == 2
     for step in (1, 2):
         (tmp_path / "checkpoints" / f"{step}.pt").write_bytes(b"")
     with pytest.raises(UserError, match=r"2.pt: this checkpoint is damaged .* remove .*checkpoints to start"):
-        newest(two)
+        newest(checkpoints)
     assert names(tmp_path) == ["1.pt", "2.pt"]
 
 
-def test_checkpoint_of_another_format_or_config_is_rejected(two, monkeypatch):
+def test_checkpoint_of_another_format_or_config_is_rejected(checkpoints, monkeypatch):
     with pytest.raises(UserError, match=r"2\.pt: this checkpoint does not fit the run \('updates'\)"):
-        two.restore(lambda state: state["updates"])
+        checkpoints.restore(lambda state: state["updates"])
     with pytest.raises(torch.OutOfMemoryError):  # not mistaken for a checkpoint that does not fit
-        two.restore(lambda state: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
+        checkpoints.restore(lambda state: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
     monkeypatch.setattr(checkpoint, "FORMAT", 99)
     with pytest.raises(UserError, match=r"format \d+, this version writes format 99"):
-        newest(two)
+        newest(checkpoints)
 
 
 def killed_at(number: int, action) -> bool:

@@ -32,7 +32,7 @@ def states(tmp_path):
 
 
 @pytest.fixture
-def carried(monkeypatch):
+def executed(monkeypatch):
     """Command lines of sweep jobs, which run in this process."""
     done = []
 
@@ -51,13 +51,13 @@ POLICIES = (
 )
 
 
-def test_certificate_is_computed_stored_and_shown(states, carried, tmp_path, monkeypatch, capsys):
+def test_certificate_is_computed_stored_and_shown(states, executed, tmp_path, monkeypatch, capsys):
     out = tmp_path / "certified"
     words = ["certify", str(states), "patch", "--out", str(out), "--change", *SMALL.split()]
     main(words)
     trained = [f"{method}/seed0/pretrain" for method in (MEMORY, *FLOORS)]
-    assert [line[-1].removeprefix(f"{out}/") for line in carried] == trained
-    assert all("--hold-out" in line and "24" in line for line in carried)
+    assert [line[-1].removeprefix(f"{out}/") for line in executed] == trained
+    assert all("--hold-out" in line and "24" in line for line in executed)
     (certificate,) = json.loads((out / "certificates.json").read_text()).values()
     assert certificate["name"] == "patch, patch_size 24"
     assert certificate["why"].startswith("R2: supervised+a -")
@@ -76,10 +76,10 @@ def test_certificate_is_computed_stored_and_shown(states, carried, tmp_path, mon
     shown = capsys.readouterr()
     assert re.search(f"is in use by .*; the certificate is only in {out}", shown.err)
 
-    before, carried[:] = contents(out / MEMORY), []
+    before, executed[:] = contents(out / MEMORY), []
     main([*words, *POLICIES.split(), "--returns"])
-    assert [line[0] for line in carried].count("pretrain") == 1, "only the state reference"
-    assert [line[0] for line in carried].count("finetune") == 4
+    assert [line[0] for line in executed].count("pretrain") == 1, "only the state reference"
+    assert [line[0] for line in executed].count("finetune") == 4
     kept = contents(out / MEMORY)
     assert {name: kept[name] for name in before} == before, "finished runs are not trained again"
     (certificate,) = json.loads((out / "certificates.json").read_text()).values()
@@ -156,6 +156,6 @@ def test_verdict_follows_from_both_intervals():
         (["--jobs", "-1"], "--jobs is -1"),
     ],
 )
-def test_invalid_input_trains_nothing(states, carried, tmp_path, words, line):
+def test_invalid_input_trains_nothing(states, executed, tmp_path, words, line):
     assert line in rejection(["certify", str(states), "patch", "--out", str(tmp_path / "out"), *words])
-    assert carried == []
+    assert executed == []

@@ -28,7 +28,7 @@ def scripts(monkeypatch):
 
 
 @pytest.fixture
-def ran(scripts, data, encoder, tmp_path):
+def ladder_run(scripts, data, encoder, tmp_path):
     """Folder of a ladder with one run of two rungs and both policies."""
     work = tmp_path / "work"
     out = work / "runs" / "walker_walk" / "finetune-td3_bc"
@@ -43,10 +43,10 @@ def ran(scripts, data, encoder, tmp_path):
     return work
 
 
-def test_ladder_keeps_policies_by_update(ran):
-    kept = ran / "snapshots" / "walker_walk" / "finetune-td3_bc"
+def test_ladder_keeps_policies_by_update(ladder_run):
+    kept = ladder_run / "snapshots" / "walker_walk" / "finetune-td3_bc"
     assert sorted(path.name for path in kept.iterdir()) == ["2.safetensors", "4.safetensors"]
-    last = ran / "runs" / "walker_walk" / "finetune-td3_bc" / "policy" / "model.safetensors"
+    last = ladder_run / "runs" / "walker_walk" / "finetune-td3_bc" / "policy" / "model.safetensors"
     assert (kept / "4.safetensors").read_bytes() == last.read_bytes() != (kept / "2.safetensors").read_bytes()
 
 
@@ -62,7 +62,7 @@ def test_curve_contains_logged_training_rows(scripts, tmp_path):
     assert [(row["step"], row["q"]) for row in curve] == [(500, "0.33333"), (1000, "2")]
 
 
-def test_curves_of_runs_in_other_work_folders_are_kept(scripts, ran, tmp_path, monkeypatch):
+def test_curves_of_runs_in_other_work_folders_are_kept(scripts, ladder_run, tmp_path, monkeypatch):
     script, results = scripts("ladder"), tmp_path / "results"
     monkeypatch.setattr(script, "RESULTS", results)
     results.mkdir()
@@ -72,14 +72,14 @@ def test_curves_of_runs_in_other_work_folders_are_kept(scripts, ran, tmp_path, m
     )
     (results / "curves.csv").write_text(before)
     for _ in range(2):
-        assert script.keep_rows(ran / "runs") == 0
+        assert script.keep_rows(ladder_run / "runs") == 0
         kept = (results / "curves.csv").read_text()
         assert kept.startswith(before), kept
         rows = list(csv.DictReader(kept.splitlines()))[2:]
         assert [(row["run"], row["step"]) for row in rows] == [("walker_walk/finetune-td3_bc", "4")]
 
 
-def test_cloning_losses_match_an_agent(scripts, ran, encoder, monkeypatch):
+def test_cloning_losses_match_an_agent(scripts, ladder_run, encoder, monkeypatch):
     script, asked = scripts("ladder_policies"), []
 
     def collect(config):
@@ -87,20 +87,20 @@ def test_cloning_losses_match_an_agent(scripts, ran, encoder, monkeypatch):
         write_fake_set(config.out, [12, 9])
         write_json(config.out / "provenance.json", {})
 
-    run = ran / "runs" / "walker_walk" / "finetune-td3_bc"
+    run = ladder_run / "runs" / "walker_walk" / "finetune-td3_bc"
     record = read_json(run / "encoder" / "config.json")
     assert record["encoder"].pop("memory_options") == {"gru_layers": 1}
     record["encoder"]["gru_layers"] = 1  # the layout of early runs
     write_json(run / "encoder" / "config.json", record)
     monkeypatch.setattr(script, "collect", collect)
-    config = script.Config("cloning", ran, ran / "cloning.csv")
+    config = script.Config("cloning", ladder_run, ladder_run / "cloning.csv")
     script.main(config)
     first = config.out.read_text()
     rows = list(csv.DictReader(first.splitlines()))
     assert [(row["run"], row["step"]) for row in rows] == [("walker_walk/finetune-td3_bc", step) for step in "24"]
     assert [(one.task, one.quality, one.episodes, one.seed) for one in asked] == [("walker_walk", "expert", 20, 10_000)]
     own = read_json(run / "config.json")["config"]["data"]
-    for name, data in (("trained_on", own), ("held_out", ran / "held_out" / "walker_walk" / "expert")):
+    for name, data in (("trained_on", own), ("held_out", ladder_run / "held_out" / "walker_walk" / "expert")):
         assert float(rows[1][name]) == pytest.approx(_loss(encoder, run / "policy", data), rel=1e-4)
     assert all(row["trained_on"] != row["held_out"] for row in rows)
 

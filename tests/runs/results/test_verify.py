@@ -10,12 +10,14 @@ import pytest
 from finetune.train import finetune
 from tests.helpers_bad_input import rejection
 from tests.helpers_stages import run_until_cut, smoke_finetune
-from tests.runs.results.test_results import COMMITTED, whole_run
+from tests.runs.results.test_results import whole_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.results import add_results, read_results, verify_results
+
+COMMITTED = Path(__file__).parents[3] / "results"
 
 
 def changed(results: Path, change: Callable[[dict[str, Any]], Any]) -> list[str]:
@@ -38,8 +40,16 @@ def results(tmp_path) -> Path:
 @pytest.mark.parametrize(
     "folder", sorted({path.parent for path in COMMITTED.rglob("runs.jsonl")}), ids=lambda p: p.name
 )
-def test_committed_results_verify(folder):
+def test_committed_results_verify_and_are_complete(folder):
     assert verify_results(folder)[1] == []
+    for run in read_results(folder):
+        assert run.ending
+        learns_no_actions = run.record["config"].get("method") in ("random", "state", "supervised+a")
+        assert run.measured or run.losses or learns_no_actions
+        assert run.labels["task"]
+        assert run.record["command"]
+        assert run.record["git_commit"]
+        assert run.files["machine"]["processor"]
 
 
 def test_verify_recomputes_run_id_from_record(results):
