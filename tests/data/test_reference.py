@@ -49,13 +49,10 @@ def test_reference_actor_is_known_only_if_single_and_shipped(tmp_path, shards, k
     assert reference.mean_reward == pytest.approx(float(dataset.reward[dataset.t > 0].mean()), abs=1e-5)
 
 
-def test_reference_of_earlier_version_has_no_mean_reward(tmp_path):
+def test_reference_round_trip_and_retired_actor(tmp_path):
+    assert Reference.read(tmp_path) == Reference(), "early versions stored no file, and then no mean reward"
     (tmp_path / REFERENCE_FILE).write_text('{"data_return": 2.0, "actor": null, "path_error": null}')
     assert Reference.read(tmp_path) == Reference(2.0)
-
-
-def test_reference_round_trip_and_retired_actor(tmp_path):
-    assert Reference.read(tmp_path) == Reference(), "earlier versions stored none"
     reference = Reference.of(
         open_dataset(write_fake_set(tmp_path / "set", attributes={"task": "walker_walk", "actor_sha256": EXPERT}))
     ).with_path_error(0.12345678)

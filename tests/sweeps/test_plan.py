@@ -334,14 +334,6 @@ def test_seeds_may_have_individual_datasets(copy, tmp_path):
         assert ({job.section for job in done}, len(done)) == ({"finetune"} if number else set(), number)
 
 
-def test_downloaded_dataset_is_found_in_its_size_folder(copy, tmp_path):
-    shutil.move(copy / "data" / "walker_walk" / "expert", tmp_path / "set")
-    shutil.move(tmp_path / "set", copy / "data" / "walker_walk" / "expert" / "84px")
-    jobs = plan(copy)
-    assert left(jobs) == []
-    assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
-
-
 def test_vd4rl_grid_uses_downloaded_datasets(tmp_path, capsys, own_cache):
     for task in ("walker_walk", "cheetah_run"):
         for quality in ("medium_expert", "expert"):
@@ -349,6 +341,7 @@ def test_vd4rl_grid_uses_downloaded_datasets(tmp_path, capsys, own_cache):
     main(["sweep", "run", "vd4rl", "--data", str(tmp_path / "vd4rl"), "--out", str(tmp_path / "out"), "--dry-run"])
     shown = capsys.readouterr().out
     assert "data collect" not in shown
+    assert f"--data {tmp_path}/vd4rl/walker_walk/expert/84px" in shown
     assert f"{4 * 6 * 5 * 2 + 4} jobs, 4 done" in shown, "6 encoders and policies per seed and dataset, 4 datasets"
 
 
