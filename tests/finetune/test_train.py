@@ -176,11 +176,12 @@ def test_diverged_policy_is_marked_and_not_saved(encoder, data, tmp_path):
     assert not (config.out / "policy").exists()
 
 
-def test_metrics_contain_scores_by_evaluation_corruption(encoder, data, tmp_path):
-    changes = {"updates": 4, "eval_every": 2, "eval_episodes": 2, "batch_size": 4, "eval_length": 2}
-    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes))
-    episodes = list(csv.DictReader((run.path / "episodes.csv").open()))
-    rows = [row for row in read_metrics(run.path / "metrics.jsonl") if any("eval/" in name for name in row)]
+def test_metrics_contain_scores_also_after_a_cut(encoder, data, tmp_path, monkeypatch):
+    """`test_interruptions.py` covers a cut before the evaluation."""
+    changes = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes, eval_episodes=2)).path
+    episodes = list(csv.DictReader((whole / "episodes.csv").open()))
+    rows = [row for row in read_metrics(whole / "metrics.jsonl") if any("eval/" in name for name in row)]
     assert [row["step"] for row in rows] == [2, 4]
     for row in rows:
         for under in (CORRUPTION, "none")[: row["step"] // 2]:
@@ -190,6 +191,18 @@ def test_metrics_contain_scores_by_evaluation_corruption(encoder, data, tmp_path
                 expected = np.mean([float(episode[measure]) for episode in mine])
                 assert row[f"eval/{measure}/{under}"] == pytest.approx(expected, abs=1e-12)
     assert "eval/score/none" not in rows[0]
+
+    def end(self, **shown):
+        if "score" in shown:
+            raise CutError
+
+    cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes, eval_episodes=2)
+    with monkeypatch.context() as patch:
+        patch.setattr("vd4rl_pomdp.runs.loop.Loop.show", end)
+        with pytest.raises(CutError):
+            run_finetune(cut)
+    run_finetune(cut)
+    assert contents(cut.out) == contents(whole)
 
 
 @pytest.mark.parametrize("algorithm", ["td3_bc", "drqv2_bc", "iql", "bc"])
@@ -211,24 +224,6 @@ def test_run_stores_critic_summary(encoder, data, tmp_path, algorithm):
     assert critic["data"] == pytest.approx(float(earned) / (1 - 0.9), abs=1e-3)
 
 
-def test_run_cut_after_an_evaluation_resumes_identically(encoder, data, tmp_path, monkeypatch):
-    """`test_interruptions.py` covers a cut before the evaluation."""
-    changes = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
-    cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-
-    def end(self, **shown):
-        if "score" in shown:
-            raise CutError
-
-    with monkeypatch.context() as patch:
-        patch.setattr("vd4rl_pomdp.runs.loop.Loop.show", end)
-        with pytest.raises(CutError):
-            run_finetune(cut)
-    run_finetune(cut)
-    assert contents(cut.out) == contents(whole.path)
-
-
 def test_clean_evaluation_has_its_own_episode_count_and_is_completed(encoder, data, tmp_path):
     """Shared episodes have equal rows; a run cut within its last evaluation completes it."""
     few = {"updates": 4, "eval_every": 2, "batch_size": 4, "eval_length": 2, "eval_episodes": 3}
@@ -246,10 +241,9 @@ def test_clean_evaluation_has_its_own_episode_count_and_is_completed(encoder, da
     assert find_results([run])[0].id == find_results([whole])[0].id
 
 
-def test_pretraining_time_is_copied_with_the_encoder(encoder, data, tmp_path):
+def test_pretraining_time_is_copied_with_the_encoder(run, encoder, data, tmp_path):
     few = {"updates": 2, "batch_size": 4, "eval_episodes": 0}
-    first = run_finetune(smoke_finetune(encoder, data, tmp_path / "first", **few)).path
-    again = run_finetune(smoke_finetune(first / "encoder", data, tmp_path / "again", **few)).path
+    again = run_finetune(smoke_finetune(run / "encoder", data, tmp_path / "again", **few)).path
     timings = (encoder.parent / "timing.json", again / "pretrain_timing.json")
     first_timing, copied_timing = (json.loads(path.read_text()) for path in timings)
     assert first_timing == copied_timing
