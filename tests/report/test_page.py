@@ -44,7 +44,7 @@ def cells(page: Path, heading: str) -> list[list[str]]:
     return [row for row in rows if row]
 
 
-def test_a_report_counts_seeds_not_episodes(tmp_path, drawn):
+def test_report_counts_seeds_not_episodes(tmp_path, drawn):
     for seed, scores in enumerate([[10.0, 30.0], [40.0, 40.0]]):
         write_run(tmp_path / f"runs/acro/{seed}", "acro", seed, {5: [90.0, 90.0], 10: scores}, film=seed == 0)
     write_run(tmp_path / "runs/random/0", "random", 0, {10: [95.0]})

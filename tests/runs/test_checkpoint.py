@@ -116,7 +116,7 @@ def killed_at(number: int, action) -> bool:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_kill_at_any_system_call_keeps_a_complete_checkpoint(tmp_path):
+def test_kill_at_any_system_call_keeps_a_complete_checkpoint(tmp_path):
     number, found = 0, set()
     while True:
         number += 1
