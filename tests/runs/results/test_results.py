@@ -133,21 +133,14 @@ def test_run_without_its_last_evaluation_is_rejected(tmp_path):
         read_run(run)
 
 
-def test_diverged_run_is_added(tmp_path):
-    run = whole_run(tmp_path / "runs/0")
-    (run / "timing.json").unlink()
-    write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
-    assert add_results([run], tmp_path / "out").startswith("1 run added")
-    (found,) = read_results(tmp_path / "out")
-    assert (found.finished, found.ending, found.diverged["step"]) == (False, 1, 7)
-
-
-def test_finished_run_replaces_its_diverged_copy(tmp_path):
+def test_diverged_run_is_added_and_replaced_once_finished(tmp_path):
     run = whole_run(tmp_path / "runs/0", score=1.5)
     (run / "timing.json").rename(tmp_path / "timing.json")
     write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
     for out in ("out", "report"):
-        add_results([run], tmp_path / out)
+        assert add_results([run], tmp_path / out) == "1 run added"
+    (found,) = read_results(tmp_path / "out")
+    assert (found.finished, found.ending, found.diverged["step"]) == (False, 1, 7)
     diverged = shutil.copytree(run, tmp_path / "diverged")
     (run / "diverged.json").unlink()
     shutil.rmtree(run)
