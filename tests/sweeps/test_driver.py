@@ -222,12 +222,21 @@ def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
     assert sorted(place.gpu for place in driver.places(LocalOptions(jobs_per_gpu=3))) == ["2"] * 3 + ["5"] * 3
     with pytest.raises(UserError, match="is more than 2 GPUs take"):
         driver.places(LocalOptions(jobs=3))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     one, before = job(tmp_path, "one"), os.sched_getaffinity(0)
     sweep(tmp_path, one)
     (seen,) = begun(one)
     share = max(1, len(before) // 2)
     assert (seen["CUDA_VISIBLE_DEVICES"], seen["OMP_NUM_THREADS"], seen["cores"]) == ("2", str(share), share)
     assert os.sched_getaffinity(0) == before
+
+
+@pytest.mark.parametrize(("threads", "expected"), [(0, "7"), (3, "3")])
+def test_a_jobs_threads_are_the_flags_then_those_of_the_environment(tmp_path, monkeypatch, threads, expected):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    one = job(tmp_path, "one")
+    assert Driver([keep_plan(tmp_path, one)], LocalOptions(threads=threads), SweepFolder(tmp_path)).run()
+    assert begun(one)[0]["OMP_NUM_THREADS"] == expected
 
 
 def test_row_after_a_truncated_row_is_complete(tmp_path, monkeypatch):

@@ -229,12 +229,14 @@ class Driver:
 def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:
     """Start the process `vd4rl-pomdp WORDS` in the plan's working directory, its output appended to `log`.
 
-    `threads` are its CPU threads; 0: one per core of its `place`.
+    `threads` are its CPU threads; 0: those of OMP_NUM_THREADS, else one per core of its `place`.
     """
     # One command line per process: anyone can repeat it by hand, a crash or OOM kill takes down nothing else, and the
     # system manages cores, GPU and signals. The exit code is all that the driver learns.
     imports = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
-    own = {JOB_VARIABLE: "1", "PYTHONPATH": imports, "OMP_NUM_THREADS": str(threads or max(1, len(place.cores)))}
+    own = {JOB_VARIABLE: "1", "PYTHONPATH": imports}
+    if threads or not os.environ.get("OMP_NUM_THREADS"):
+        own["OMP_NUM_THREADS"] = str(threads or max(1, len(place.cores)))
     own |= {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
     program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: do not import from the working directory
     mine = os.sched_getaffinity(0) if place.cores else set()

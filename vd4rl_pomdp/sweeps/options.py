@@ -25,7 +25,7 @@ class LocalOptions(Options):
     jobs_per_gpu: int = 1
     """Concurrent jobs per GPU."""
     threads: int = 0
-    """CPU threads per job; 0: its share of the machine's cores."""
+    """CPU threads per job; 0: OMP_NUM_THREADS if it is set, else its share of the machine's cores."""
     stack: int = 1
     """Maximum fine-tunings trained together in one process, in the slot of one job.
     Results match single runs up to rounding."""
