@@ -1,3 +1,4 @@
+import pickle
 import warnings
 
 import gymnasium
@@ -43,6 +44,18 @@ def test_ids_pass_the_gymnasium_checker(name):
         warnings.simplefilter("error", UserWarning)  # Gymnasium's kind
         check_env(env.unwrapped)
     env.close()
+
+
+def test_an_environment_passes_to_another_process():
+    """As pickled by a worker that is spawned: one that has begun arrives as a new one."""
+    env = make("WalkerWalk", corruption="patch+zero_frames", patch_size=24, frame_size=64)
+    env.reset(seed=3)
+    sent = pickle.loads(pickle.dumps(env.unwrapped))
+    with pytest.raises(UserError, match="call reset"):
+        sent.step(np.zeros(6, np.float32))
+    np.testing.assert_array_equal(sent.reset(seed=5)[0], env.reset(seed=5)[0])
+    for action in (np.ones(6, np.float32), -np.ones(6, np.float32)):
+        np.testing.assert_array_equal(sent.step(action)[0], env.step(action)[0])
 
 
 def test_frame_stack_order_and_padding():

@@ -16,13 +16,14 @@ from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.pixels import Render, checked_action
 
 
-class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class GymEnv(gymnasium.Env[np.ndarray, np.ndarray], gymnasium.utils.EzPickle):
     """A task with corrupted pixels. Episodes end only if the task terminates; the registered ids add a time limit.
 
     Observations: (9, S, S) uint8, three frames of `frame_size`, oldest first. Actions: (A,) float32 in [-1, 1]. `info`
     holds `clean`, the observation before corruption, and `physics`, the (P,) float64 simulator state (P = 0 for a task
     without states). `reset(seed=...)` determines the initial states and corruptions of all following episodes.
     `corruption_fields` are the corruption's mode and options; UserError for an unknown or invalid one.
+    A pickled or copied environment is a new one, before its first `reset`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -36,6 +37,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         frame_size: int = FRAME_SIZE,
         **corruption_fields: Any,
     ) -> None:
+        gymnasium.utils.EzPickle.__init__(self, task, corruption, render, render_mode, frame_size, **corruption_fields)
         refuse_number("frame_size", frame_size, *FRAME_SIZES)
         config = CorruptionConfig.of(corruption, **corruption_fields)
         check_corruption_fits(config, frame_size)
