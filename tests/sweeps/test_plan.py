@@ -139,6 +139,16 @@ def test_folder_names_planned_by_another_grid_are_not_reused(tmp_path, capsys):
     assert plan(tmp_path, ["finetune.updates=30"], others=first) == first, "jobs of both grids are shared"
 
 
+def test_a_name_shows_the_corruption_that_a_where_sets_for_some_tasks(tmp_path):
+    grid = GRID.replace('task = "walker_walk"', 'task = ["walker_walk", "cheetah_run"]').split("[[block]]")[0]
+    where = '[[where]]\nonly = ["task=cheetah_run"]\npretrain = { patch_size = 24, batch_size = 8 }\n'
+    (tmp_path / "grid.toml").write_text(f'{grid}[[block]]\npretrain = {{ method = "acro" }}\n{where}')
+    assert [job.name for job in plan(tmp_path) if job.section == "pretrain"] == [
+        "walker_walk/expert/patch/acro/seed0/pretrain",
+        "cheetah_run/expert/patch/acro,patch_size=24/seed0/pretrain",
+    ]
+
+
 def test_long_folder_names_are_replaced_by_a_hash(tmp_path):
     many = {name: 2 for name in ("batch_size", "hidden_dim", "views", "shift", "eval_every", "log_every", "n_step")}
     many |= {"checkpoint_every": 2, "eval_length": 2, "updates": 2, "learning_rate": 0.01, "alpha": 0.5, "gamma": 0.5}

@@ -33,7 +33,7 @@ import itertools
 import runpy
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,6 @@ PIXELS = ("collect", "pretrain", "finetune")
 MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
 SHARED = ("seed", "preset")  # settings outside the sections
-_SETS = ("collect", "navigation_collect")
 _TRAININGS = ("pretrain", "finetune", "navigation_train")
 _FOLDERS = {"out", "data", "encoder"}  # settings that the sweep itself fills in
 Values = dict[str, Any]
@@ -60,8 +59,10 @@ class GridCell:
 
     sections: Sections  # settings, one value each
     named: Mapping[str, Sequence[str]]
-    """By section, settings that distinguish this cell within its grid and so appear in folder names: axes, a block's
-    own settings and, for datasets, those set by a `where`."""
+    """By section, settings that distinguish this cell within its grid and so appear in folder names: axes and a block's
+    own settings."""
+    overridden: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """By section, settings that a `where` has set."""
 
     @property
     def chain(self) -> tuple[str, ...]:
@@ -96,10 +97,8 @@ class Where:
             section: {name: value for name, value in settings.items() if name not in last.get(section, {})}
             for section, settings in self.sections.items()
         }
-        # A dataset is identified by its folder's name, so overrides must show there; a run is identified by its recipe.
-        more = {section: own.get(section, {}) if section in _SETS else {} for section in cell.named}
-        named = {section: list(dict.fromkeys([*names, *more[section]])) for section, names in cell.named.items()}
-        return GridCell(_merge(cell.sections, own), named)
+        overridden = {section: [*cell.overridden.get(section, ()), *names] for section, names in own.items()}
+        return replace(cell, sections=_merge(cell.sections, own), overridden={**cell.overridden, **overridden})
 
 
 @dataclass(frozen=True)

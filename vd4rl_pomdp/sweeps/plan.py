@@ -17,6 +17,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import settings_of, words_of
 from vd4rl_pomdp.core.registry import of_other_code
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, SET_QUALITIES, TASKS
+from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan, shard_files, shard_paths, task_and_quality
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size
 from vd4rl_pomdp.data.shards import differing
@@ -328,8 +329,12 @@ def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any])
 
 def _extras(cell: GridCell, section: str) -> str:
     """Folder suffix of the other distinguishing settings: ",history=gru,max_k=1", or a hash if too long."""
-    named = {name: cell.sections[section][name] for name in cell.named.get(section, ())}
-    words = (f",{name}={value}" for name, value in named.items() if name not in _IN_NAMES[section])
+    values = cell.sections[section]
+    # Of what a [[where]] sets, a name shows what changes the data: a dataset is identified by it, and its corruption is
+    # looked for in it.
+    changes_data = values.keys() if section == cell.chain[0] else corruption_settings(values.get("corruption", "none"))
+    shown = [*cell.named.get(section, ()), *(n for n in cell.overridden.get(section, ()) if n in changes_data)]
+    words = (f",{name}={values[name]}" for name in dict.fromkeys(shown) if name not in _IN_NAMES[section])
     extras = "".join(words).replace("/", "_")
     return extras if len(extras.encode()) <= _LONGEST else f",{content_hash(extras)}"
 
