@@ -46,6 +46,26 @@ def test_comparing_a_set_with_itself_shows_no_difference(tmp_path):
         assert row["score_a"] == row["score_b"]
 
 
+def test_sets_that_share_runs_are_not_compared_as_independent_samples(tmp_path, capsys):
+    a, b, c = (tmp_path / name for name in "abc")
+    for folder, seeds in ((a, (0, 1, 2)), (b, (1, 2, 3)), (c, (3, 4))):
+        for seed in seeds:
+            describe(write_run(folder / str(seed), "acro", seed, {10: [20.0 + seed]}), {})
+    (row,) = compare_results(a, b).rows
+    assert (row["difference"], row["low"], row["high"], row["shared"]) == (1.0, None, None, 2)
+    main(["report", "compare", str(a), str(b), "--out", str(tmp_path / "out")])
+    line = "No interval where a run is in both sets"
+    shown = " ".join(capsys.readouterr().out.split())
+    assert line in shown
+    assert "3 | 3, 2 in both" in shown
+    assert line in (tmp_path / "out" / "index.html").read_text()
+    (row,) = compare_results(a, c).rows
+    welch = scipy.stats.ttest_ind([23, 24], [20, 21, 22], equal_var=False).confidence_interval(0.95)
+    assert (row["shared"], row["low"], row["high"]) == (0, *map(pytest.approx, welch))
+    main(["report", "compare", str(a), str(c)])
+    assert line not in " ".join(capsys.readouterr().out.split())
+
+
 def test_variants_are_matched_by_name_or_as_single_candidates(tmp_path):
     for k in (1, 15):
         describe(write_run(tmp_path / f"a/{k}", "mik+a", 0, {10: [k]}), {"max_k": k})

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pandas as pd
 from rich.console import Console
 
@@ -21,6 +20,7 @@ from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import certificates_of
 
+NOT_INDEPENDENT = "No interval where a run is in both sets: they are not independent samples; compare disjoint sets."
 FILE = "comparison"  # base name of its files, by which a comparison's folder is recognised
 Conditions = dict[tuple, list[Run]]  # finished runs by the values of CONDITION
 
@@ -31,7 +31,8 @@ class SideBySide(NamedTuple):
     sides: list[Row]
     """Of each set its `path`, numbers of `finished` runs and of `others`, not compared, and what it was `made` with."""
     rows: list[Row]
-    """One per condition: scores with intervals and n of both, difference with interval, differing settings, memory."""
+    """One per condition: scores with intervals and n of both, difference with interval, number of runs `shared` by both
+    sets (then no interval), differing settings, memory."""
 
 
 def compare_results(one: Path, other: Path) -> SideBySide:
@@ -87,14 +88,19 @@ def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
     for side, mine in zip("ab", scores, strict=True):
         nothing = dict.fromkeys((f"score_{side}", f"low_{side}", f"high_{side}"))
         row |= (mean_and_ends(mine, suffix=f"_{side}") if len(mine) else nothing) | {f"seeds_{side}": len(mine)}
-    row |= {"difference": None, "low": None, "high": None, "settings": ""}
+    shared = len({_evaluated(run) for run in one} & {_evaluated(run) for run in other})
+    row |= {"difference": None, "low": None, "high": None, "shared": shared, "settings": ""}
     if one and other:
         a, b = scores
-        same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(a, b)
-        # Identical runs are not two samples: no interval around a difference of 0.
-        row["low"], row["high"] = (None if same else stats.difference_interval(b, a)) or (None, None)
+        # The interval is of independent samples, and a run with itself is no pair of two measurements.
+        row["low"], row["high"] = (None if shared else stats.difference_interval(b, a)) or (None, None)
         row |= {"difference": float(b.mean() - a.mean()), "settings": _differing(one, other)}
     return row
+
+
+def _evaluated(run: Run) -> tuple:
+    """What makes two finished runs one: what was computed, and the scores of its last evaluation."""
+    return run.result.id, *(episode["score"] for episode in run.last)
 
 
 def _differing(one: list[Run], other: list[Run]) -> str:
@@ -115,7 +121,9 @@ _COLUMNS: Columns = {
     "A": ("score_a", "low_a", "high_a", 1),
     "B": ("score_b", "low_b", "high_b", 1),
     "B – A": ("difference", "low", "high", 1),
-    "seeds": lambda row: f"{row['seeds_a']} | {row['seeds_b']}",
+    "seeds": lambda row: (
+        f"{row['seeds_a']} | {row['seeds_b']}" + (f", {row['shared']} in both" if row["shared"] else "")
+    ),
 }
 
 
@@ -131,6 +139,8 @@ def print_comparison(comparison: SideBySide) -> None:
     for place, part in shown.assign(method=method).groupby("setting", sort=False):
         console.print(f"memory: {comparison.rows[part.index[0]]['memory']}", markup=False, highlight=False)
         console.print(terminal(str(place), part.drop(columns="setting").replace(r" \[", "\n[", regex=True)))
+    if any(row["shared"] for row in comparison.rows):
+        console.print(NOT_INDEPENDENT, markup=False, highlight=False)
 
 
 def write_comparison(comparison: SideBySide, out: Path) -> Path:
@@ -142,6 +152,7 @@ def write_comparison(comparison: SideBySide, out: Path) -> Path:
     for place, part in shown.groupby("setting", sort=False):
         note = seeds_note(rows.loc[part.index, ["seeds_a", "seeds_b"]].stack())
         note += f" Memory: {rows['memory'][part.index[0]]}."
+        note += f" {NOT_INDEPENDENT}" if rows.loc[part.index, "shared"].any() else ""
         blocks.append(block(str(place), part.drop(columns="setting"), 2, note))
     write_table(out / f"{FILE}.csv", rows)
     write_latex(out / f"{FILE}.tex", shown, 3, f"{SCORE}. Mean over seeds, 95% t intervals over seeds and episodes.")
