@@ -1,9 +1,11 @@
 """Export and import of LeRobot's format. `tools/lerobot_check.py` reads an export with LeRobot itself."""
 
+import io
 import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.helpers_data import assert_equal_rows, fake_episode, fake_reward, rows_of_set, write_fake_set
 from vd4rl_pomdp.cli import main
@@ -44,6 +46,14 @@ def edit_info(folder, change):
     info = json.loads((folder / "meta" / "info.json").read_text())
     change(info)
     (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def deepen(table):
+    """Replace the images by ones of 16 bits."""
+    file = io.BytesIO()
+    Image.fromarray(np.full((84, 84), 600, np.uint16)).save(file, "PNG")
+    images = arrow.array([{"bytes": file.getvalue(), "path": None}] * len(table), table.schema.field(PICTURE).type)
+    return table.set_column(table.schema.get_field_index(PICTURE), PICTURE, images)
 
 
 def as_others_write(folder, scale=1.0):
@@ -182,6 +192,7 @@ def test_lerobot_camera_is_selected_by_picture_option(exported, tmp_path):
         (lambda out: (out / DATA).unlink(), "No such file"),
         (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
         (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "lacks rows"),
+        (lambda out: rewrite(out, deepen), "more than 8 bits per channel .*: convert it to 8 bits"),
         (lambda out: edit_info(out, lambda info: info["features"].pop("observation.image")), "holds no images"),
     ],
 )

@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 from zipfile import BadZipFile
 
-import torch
-from safetensors.torch import load
-from torch import Tensor
-
 from vd4rl_pomdp.core.errors import UserError, disk_error
+
+if TYPE_CHECKING:
+    from PIL import Image
+    from torch import Tensor
 
 T = TypeVar("T")
 _PARSING = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, csv.Error, BadZipFile, zlib.error)
@@ -105,8 +105,20 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     Raises:
         FileNotFoundError, SafetensorError: the file is missing, or is no safetensors file.
     """
+    from safetensors.torch import load  # loads torch, which commands that read no tensors do not
+
     tensors = load(read_bytes(path))
-    bad = next((n for n, v in tensors.items() if v.is_floating_point() and not torch.isfinite(v).all()), None)
+    bad = next((n for n, v in tensors.items() if v.is_floating_point() and not v.isfinite().all()), None)
     if bad is not None:
         raise UserError(f"{path}: {bad!r} is not finite, so the file is damaged; use another copy or train again")
     return tensors
+
+
+def rgb_of(image: Image.Image) -> Image.Image:
+    """An opened image in RGB; UserError for one of more than 8 bits per channel, such as a depth map.
+
+    Pillow would set everything above 255 to white.
+    """
+    if image.mode.startswith(("I", "F")):
+        raise UserError(f"has an image of more than 8 bits per channel (mode {image.mode}): convert it to 8 bits")
+    return image if image.mode == "RGB" else image.convert("RGB")

@@ -58,6 +58,13 @@ def cifar_binary(folder, count: int = 4) -> np.ndarray:
     return images
 
 
+def deep_png() -> bytes:
+    """Of 16 bits, as depth cameras and microscopes write."""
+    file = io.BytesIO()
+    Image.fromarray(np.arange(100, dtype=np.uint16).reshape(10, 10) * 600).save(file, "PNG")
+    return file.getvalue()
+
+
 def torn_png() -> bytes:
     """A PNG with a wrong chunk length."""
     whole = io.BytesIO()
@@ -124,6 +131,7 @@ def test_only_images_of_the_pool_are_read(tmp_path, monkeypatch):
         ("data_batch_1", b"\xfe\xfe\xfe", "is not a CIFAR-10 file"),
         ("a.png", b"not a picture", "cannot be read as an image"),
         ("a.png", torn_png(), "cannot be read as an image"),
+        ("a.png", deep_png(), "more than 8 bits per channel .*: convert it to 8 bits"),
     ],
 )
 def test_unusable_image_folders_are_rejected(tmp_path, name, content, message):

@@ -25,7 +25,7 @@ import pandas as pd
 from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import fits
+from vd4rl_pomdp.core.reading import fits, rgb_of
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import FRAMES_KEY
 from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, chosen, library, rows_of
@@ -77,7 +77,7 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
                 raise UserError("its images are stored outside data/, which is not supported")
             else:
                 opened = (Image.open(io.BytesIO(one)) for one in stored[key])
-                frames = _stacked([np.asarray(one if one.mode == "RGB" else one.convert("RGB")) for one in opened])
+                frames = _stacked([np.asarray(rgb_of(one)) for one in opened])
             yield _rows(stored, frames, own)
 
     size = sum(file.stat().st_size for file in {*data, *films})
