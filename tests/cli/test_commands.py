@@ -143,6 +143,25 @@ def test_help_imports_no_torch_and_survives_a_closed_pipe():
     assert (process.communicate()[1], process.returncode) == (b"", 141)
 
 
+CONFIGURED = {"list", "data collect", "data view", "pretrain", "finetune", "evaluate", "navigation collect"}
+CONFIGURED |= {"navigation train", "navigation policy"}
+"""Commands whose flags are those of configs and parts that need torch, and the list of these parts."""
+
+
+def test_help_and_the_list_of_grids_need_no_torch():
+    words = [["sweep", "list"], *([*name.split(), "--help"] for name in COMMANDS if name not in CONFIGURED)]
+    code = (
+        "import contextlib, sys; from vd4rl_pomdp.cli import main\n"
+        f"for words in {words}:\n"
+        "    with contextlib.suppress(SystemExit): main(words)\n"
+        "    if 'torch' in sys.modules: sys.exit(f'{words} loads torch')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("usage:") == len(words) - 1
+    assert "paper_patch_zero" in done.stdout
+
+
 def test_missing_extra_is_named(tmp_path):
     words = ["navigation", "collect", "--maze", "no_curtain", "--preset", "smoke", "--workers", "1", "--out", "x"]
     code = (

@@ -8,15 +8,19 @@ from pathlib import Path
 
 import tyro
 
+from vd4rl_pomdp.cli.later import loaded_on_use
 from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.data import collect as collection
-from vd4rl_pomdp.data import download as published
-from vd4rl_pomdp.data import transfer
-from vd4rl_pomdp.data.card import write_card
-from vd4rl_pomdp.data.check import check_dataset
-from vd4rl_pomdp.report.browse import ViewConfig, write_view
 from vd4rl_pomdp.sweeps.options import program_name
+
+with loaded_on_use():
+    from vd4rl_pomdp.data import card as cards
+    from vd4rl_pomdp.data import check as checking
+    from vd4rl_pomdp.data import collect as collection
+    from vd4rl_pomdp.data import download as published
+    from vd4rl_pomdp.data import parity as pixels
+    from vd4rl_pomdp.data import transfer
+    from vd4rl_pomdp.report import browse
 
 REPLAY_TOLERANCE = 1e-6
 """Largest accepted difference between stored and replayed rewards; 0 on the machine that collected them."""
@@ -108,12 +112,12 @@ def card(set: tyro.conf.Positional[Path]) -> None:
     Args:
         set: Dataset folder.
     """
-    print(f"card: {write_card(set)}")
+    print(f"card: {cards.write_card(set)}")
 
 
 def view(words: list[str], program: str) -> None:
     """Write an HTML page to browse episodes."""
-    print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
+    print(f"page: {browse.write_view(parse_stage(browse.ViewConfig, words, program))}")
 
 
 @command
@@ -124,7 +128,7 @@ def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
         set: Dataset folder.
         json: Print one JSON object.
     """
-    result = check_dataset(set)
+    result = checking.check_dataset(set)
     show(result, json)
     error = result["replay_max_error"]
     if error is not None and error > REPLAY_TOLERANCE:
@@ -142,9 +146,7 @@ def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) ->
         set: Compare this dataset's background; without it, the reference frames are compared.
         json: Print one JSON object.
     """
-    from vd4rl_pomdp.data.parity import check_parity  # loads OpenGL
-
-    result = check_parity(set)
+    result = pixels.check_parity(set)
     show(result, json)
     if not result["equal"] and set:
         raise UserError(f"the environment's background differs from that of {set}: see `background` above")

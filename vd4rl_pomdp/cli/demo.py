@@ -13,25 +13,28 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from vd4rl_pomdp.cli.hub import play
+from vd4rl_pomdp.cli.later import loaded_on_use
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.cli.report import report
 from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.envs.mazes import get_maze
-from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs import EPISODES_FILE, PROBE_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
-from vd4rl_pomdp.runs.workers import count_workers
-from vd4rl_pomdp.studies.navigation.figures import write_film
-from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs, refitted_error
-from vd4rl_pomdp.sweeps.driver import visible_gpus
-from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.options import LocalOptions
-from vd4rl_pomdp.sweeps.plan import Job, plan_jobs
+
+with loaded_on_use():
+    from vd4rl_pomdp.report import load
+    from vd4rl_pomdp.runs import workers
+    from vd4rl_pomdp.studies.navigation import figures
+    from vd4rl_pomdp.studies.navigation import runs as mazes
+    from vd4rl_pomdp.sweeps import driver
+    from vd4rl_pomdp.sweeps import folder as folders
+    from vd4rl_pomdp.sweeps import plan as planning
 
 GRIDS = {"runs": "quick"} | ({"navigation": "quick_navigation"} if find_spec("gymnasium_robotics") else {})
 """Grid by output folder; mazes only if their extra is installed."""
@@ -45,13 +48,13 @@ MOST_AT_ONCE = 4
 """Maximum concurrent jobs; more would not finish sooner."""
 
 
-def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
+def demo_jobs(out: Path, preset: str = "cpu") -> list[planning.Job]:
     """The demo's jobs, in order; UserError for an unknown preset."""
     refuse_unknown("preset", preset, PRESETS)
     jobs = []
     for folder, grid in GRIDS.items():
         runs, cells = out / folder, load_grid(grid, testing=PRESETS[preset]).cells()
-        jobs += plan_jobs(cells, runs, out / "data")[0]
+        jobs += planning.plan_jobs(cells, runs, out / "data")[0]
     return jobs
 
 
@@ -65,12 +68,12 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
         preset: cpu: minutes; smoke: only tests that every stage runs.
     """
     started = time.monotonic()
-    at_once = 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)  # 0: one per GPU
+    at_once = 0 if driver.visible_gpus() else min(workers.count_workers(0), MOST_AT_ONCE)  # 0: one per GPU
     options = LocalOptions(jobs=jobs or at_once)
     options.check()
     refuse_no_folder(out)
     refuse_kept(out)
-    planned, folder = demo_jobs(out, preset), SweepFolder(out)
+    planned, folder = demo_jobs(out, preset), folders.SweepFolder(out)
     play([*PAIR, "--episodes", "1" if PRESETS[preset] else "10", "--film", str(out / DUEL)], "vd4rl-pomdp agents play")
     print("One training seed each. All seeds: results/protocol. Now the same from the start, small:", flush=True)
     words = ["report", str(out / "runs"), "--out", str(out / "report")]
@@ -87,7 +90,7 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
 
 
-def conclusion(jobs: list[Job]) -> Iterator[str]:
+def conclusion(jobs: list[planning.Job]) -> Iterator[str]:
     """Summary lines: probe errors and returns of the demo's methods, with standard errors."""
     policies = [(job.settings, job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
@@ -99,19 +102,19 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
         last = max(row["step"] for row in rows)
         returns = [row["return"] for row in rows if row["step"] == last]
         probe = read_json(folder / PROBE_FILE)
-        known = ", ".join(f"{probe[name]:.0f}" for name in PROBES)
+        known = ", ".join(f"{probe[name]:.0f}" for name in load.PROBES)
         yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
     yield "One seed each: between seeds probe errors hardly vary, but returns do."
     yield "Three seeds on 100 episodes: results/control."
 
 
-def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
+def show_navigation(jobs: list[planning.Job], film: Path) -> Iterator[str]:
     """Write the video; yield lines with each method's position error while a curtain hides the mass."""
-    runs = load_runs(find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
+    runs = mazes.load_runs(mazes.find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
     trajectories = {run.condition.method: run.trajectory for run in runs if run.trajectory is not None}
-    write_film(trajectories, get_maze(runs[0].condition.maze), film)
+    figures.write_film(trajectories, get_maze(runs[0].condition.maze), film)
     yield "Held-out position error behind curtains, % of a standard deviation (one seed):"
     for run in runs:
-        error = run.values.get(refitted_error("position", rows="hidden"))
+        error = run.values.get(mazes.refitted_error("position", rows="hidden"))
         yield f"  {run.condition.method:<12}{'no hidden step' if error is None else f'{error:.0f}'}"
     yield f"Film of the mass and of each method's estimate: {film}"

@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from vd4rl_pomdp import hub
+from vd4rl_pomdp.cli.later import loaded_on_use
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder
-from vd4rl_pomdp.report.films import side_by_side
 from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
+
+with loaded_on_use():
+    from finetune import export as exporting
+    from vd4rl_pomdp import hub
+    from vd4rl_pomdp.report import films
 
 
 @command
@@ -61,9 +65,7 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
         episodes: Episodes played by the exported agent for its card, with and without its corruption.
         workers: Worker processes; 0 uses every core.
     """
-    from finetune.export import export_agent  # loads OpenGL
-
-    card = export_agent(run, out, episodes, workers)
+    card = exporting.export_agent(run, out, episodes, workers)
     for under in dict.fromkeys(row["evaluated_under"] for row in card["episodes"]):
         returns = [row["return"] for row in card["episodes"] if row["evaluated_under"] == under]
         print(f"{len(returns)} episodes under {under}: mean return {sum(returns) / len(returns):.4f}")
@@ -83,14 +85,12 @@ def play(
         film: File to write (animated WebP): each agent's first episode as it sees it.
         workers: Worker processes; 0 uses every core.
     """
-    from finetune.export import play_agents  # loads OpenGL
-
     if film:
         refuse_inside(film)
         refuse_no_folder(film.parent)
         if film.is_dir():
             raise UserError(f"{film}: is a folder; name a file for the film")
-    cards, played = play_agents(agents, episodes, workers)
+    cards, played = exporting.play_agents(agents, episodes, workers)
     under = cards[0]["corruption"]["corruption"]
     print(f"{episodes} episodes of {cards[0]['task']} under {under}: mean return [95% t interval over episodes]")
     returns = [np.array([episode.total for episode in one])[:, None] for one in played]
@@ -103,5 +103,5 @@ def play(
     if film:
         with disk_errors(film.parent):
             film.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(film, side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
+        write_bytes(film, films.side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
         print(f"film: {film}")

@@ -7,15 +7,18 @@ from pathlib import Path
 
 import tyro
 
+from vd4rl_pomdp.cli.later import loaded_on_use
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.report import compare as comparing
-from vd4rl_pomdp.report.load import ALL
-from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.results import add_results, verify_results
 from vd4rl_pomdp.sweeps.grid import load_grid, narrow
-from vd4rl_pomdp.sweeps.members import GridMembers
+
+with loaded_on_use():
+    from finetune import evaluation
+    from vd4rl_pomdp.report import compare as comparing
+    from vd4rl_pomdp.report import load, page
+    from vd4rl_pomdp.runs import results
+    from vd4rl_pomdp.sweeps import members
 
 
 @command
@@ -37,13 +40,13 @@ def report(
         only: Report only grid cells with these values: method=mik+a,acro seed=0.
         change: Overrides that the grid was run with: preset=cpu finetune.updates=20000.
     """
-    choice = ALL
+    choice = load.ALL
     if grid:
-        choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
+        choice = members.GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
     elif only or change:
         raise UserError("--only and --change apply to the cells of a grid: add --grid")
-    written = write_report(named(runs), out, choice)
-    print_summary(written)
+    written = page.write_report(named(runs), out, choice)
+    page.print_summary(written)
     for sentence in written.unlike:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"report: {written.page}")
@@ -84,7 +87,7 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
         runs: Run folders, results folders, or folders that contain some.
         out: The results folder; created if missing.
     """
-    print(f"{out}: {add_results(named(runs), out)}")
+    print(f"{out}: {results.add_results(named(runs), out)}")
 
 
 @command
@@ -95,9 +98,7 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
         folder: The results folder.
         replay: Folder of a run with encoder and policy; the first episode of its last evaluation is replayed.
     """
-    from finetune import evaluation  # loads OpenGL
-
-    runs, wrong = verify_results(folder)
+    runs, wrong = results.verify_results(folder)
     print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
     if replay is not None:
         row, now, where = evaluation.replay(replay, runs)

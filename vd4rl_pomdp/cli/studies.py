@@ -8,16 +8,21 @@ from pathlib import Path
 
 import tyro
 
+from vd4rl_pomdp.cli.later import loaded_on_use
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import refuse_no_folder
-from vd4rl_pomdp.report import theory as theory_page
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_kept
-from vd4rl_pomdp.runs.results import CERTIFICATES, certificate_in_words
-from vd4rl_pomdp.studies import certify as certificates
-from vd4rl_pomdp.studies.theory import theory_study
-from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.options import LocalOptions, own_program, refuse_unknown_to_jobs
+
+with loaded_on_use():
+    from vd4rl_pomdp.bench import gpu as on_gpu
+    from vd4rl_pomdp.bench import suite
+    from vd4rl_pomdp.report import theory as theory_page
+    from vd4rl_pomdp.runs import results as results_folder
+    from vd4rl_pomdp.studies import certify as certificates
+    from vd4rl_pomdp.studies.theory import study as theory_study
+    from vd4rl_pomdp.sweeps import folder as folders
 
 
 @command
@@ -31,7 +36,7 @@ def theory(json: bool = False, out: Path | None = None) -> None:
     if out is not None:
         refuse_foreign(out, "study of the theory", theory_page.FILE)
         out.mkdir(parents=True, exist_ok=True)  # fail before the computation
-    study = theory_study()
+    study = theory_study.theory_study()
     if json:
         print(json_library.dumps(study))
     else:
@@ -52,17 +57,16 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
             It takes under three minutes.
         device: Training device: auto, cpu or cuda. With --gpu and --quick, cpu tests the code without a GPU.
     """
-    from vd4rl_pomdp.bench import gpu as on_gpu  # loads OpenGL
-    from vd4rl_pomdp.bench.suite import GOALS, bench, print_table
-
-    results = on_gpu.gpu_bench(device, quick) if gpu else bench(quick, device)
+    results = on_gpu.gpu_bench(device, quick) if gpu else suite.bench(quick, device)
     if json:
         show(results, as_json=True)
     elif gpu:
         claims = on_gpu.AIMS if results["device"] == "cuda" and not quick else {}
-        print_table(results, claims, "one GPU, medians of one run" if claims else "a trial of the code: no claims")
+        suite.print_table(
+            results, claims, "one GPU, medians of one run" if claims else "a trial of the code: no claims"
+        )
     else:
-        print_table(results, {} if quick else GOALS, "speed and memory, ratios within one run")
+        suite.print_table(results, {} if quick else suite.GOALS, "speed and memory, ratios within one run")
 
 
 @command
@@ -91,7 +95,7 @@ def certify(
     dataset, cells, trainings = certificates.planned(data, corruption, out, returns, change)
     for training in trainings:
         refuse_unknown_to_jobs(training.settings)
-    folder = SweepFolder(out)
+    folder = folders.SweepFolder(out)
     carry_out([folder.keep_plan(certificates.GRID, trainings, own_program())], folder, "local", options)
-    print(f"{corruption}: {certificate_in_words(certificates.certify(dataset, cells, out, returns))}")
-    print(f"certificate: {out / CERTIFICATES}")
+    print(f"{corruption}: {results_folder.certificate_in_words(certificates.certify(dataset, cells, out, returns))}")
+    print(f"certificate: {out / results_folder.CERTIFICATES}")

@@ -13,13 +13,11 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
+from vd4rl_pomdp.cli.later import loaded_on_use
 from vd4rl_pomdp.cli.parsing import command, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.runs.outputs import refuse_kept
-from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
-from vd4rl_pomdp.sweeps.driver import Driver, in_stacks
-from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, failed, failure, in_lines, jobs_of, plan_name, status
 from vd4rl_pomdp.sweeps.grid import SHARED, load_grid, names, narrow
 from vd4rl_pomdp.sweeps.options import (
     EXECUTORS,
@@ -29,8 +27,11 @@ from vd4rl_pomdp.sweeps.options import (
     program_name,
     refuse_unknown_to_jobs,
 )
-from vd4rl_pomdp.sweeps.plan import DATA, Job, plan_jobs, runs_kept
-from vd4rl_pomdp.sweeps.stages import check_cells
+
+with loaded_on_use():
+    from vd4rl_pomdp.sweeps import clusters, driver, stages
+    from vd4rl_pomdp.sweeps import folder as folders
+    from vd4rl_pomdp.sweeps import plan as planning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,17 +86,17 @@ def run(words: list[str], program: str) -> None:
     config = parse_stage(RunCommand, words, program)
     grid = load_grid(config.grid, config.change, config.testing)
     cells = narrow(grid.cells(), config.only)
-    check_cells(cells, config.grid)
+    stages.check_cells(cells, config.grid)
     # Check before planning, which may decode datasets for minutes.
     for place in (config.out, config.data or config.out):
         refuse_no_folder(place)
     refuse_kept(config.out)
-    folder = SweepFolder(config.out)
+    folder = folders.SweepFolder(config.out)
     file = [str(Path(config.grid).resolve())] * (config.grid not in names())  # a different file is a different grid
     changes = (f"change {word}" for word in config.change)  # not to be taken for the same words of --only
-    name = plan_name(grid.name, [*file, *config.only, *changes, *["testing"] * config.testing])
-    data, others = config.data or config.out / DATA, folder.jobs_of_others(name)
-    jobs, warnings = plan_jobs(cells, config.out, data, runs_kept(config.done), others)
+    name = folders.plan_name(grid.name, [*file, *config.only, *changes, *["testing"] * config.testing])
+    data, others = config.data or config.out / planning.DATA, folder.jobs_of_others(name)
+    jobs, warnings = planning.plan_jobs(cells, config.out, data, planning.runs_kept(config.done), others)
     for job in jobs:
         refuse_unknown_to_jobs(job.settings)
     for warning in warnings:
@@ -107,22 +108,22 @@ def run(words: list[str], program: str) -> None:
     carry_out([plan], folder, config.executor, config.options, name)
 
 
-def _print_plan(jobs: list[Job], stack: int) -> None:
+def _print_plan(jobs: list[planning.Job], stack: int) -> None:
     """Print each job as one shell line, shared jobs, and the number of processes."""
     users = Counter(name for job in jobs for name in job.needs)
-    left: list[Job] = []
+    left: list[planning.Job] = []
     for job in jobs:
         state = "done" if job.finished else "resumes" if job.begun else "new"
         print(f"# {job.name}: {state}" + f", for {users[job.name]} jobs" * (users[job.name] > 1))
         if state != "done":
             print(f"{program_name()} {shlex.join(job.words)}")
             left.append(job)
-    processes = len(in_stacks(left, stack, {}))
+    processes = len(driver.in_stacks(left, stack, {}))
     packed = f" in at least {processes} processes" if processes < len(left) else ""
     print(f"# {len(jobs)} jobs, {len(jobs) - len(left)} done, {len(left)} to do{packed}")
 
 
-def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
+def carry_out(plans: list[folders.Plan], folder: folders.SweepFolder, kind: str, options: Any, name: str = "") -> None:
     """Run plans to their end by an executor and its options; SystemExit 1 if some jobs are not finished.
 
     `name` is the plan's, empty for all plans in the folder.
@@ -130,15 +131,15 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
     if JOB_VARIABLE in os.environ:
         raise UserError("a job cannot start a sweep: end the file in `main()`, which reads the job's own command line")
     if kind == "local":
-        finished = Driver(plans, options, folder).run()
+        finished = driver.Driver(plans, options, folder).run()
     else:
-        cluster = {"slurm": SlurmCluster, "ray": RayCluster}[kind](options, folder.path / kind)
-        finished = watch(plans, cluster, folder, name)
-    jobs = jobs_of(plans)
+        cluster = {"slurm": clusters.SlurmCluster, "ray": clusters.RayCluster}[kind](options, folder.path / kind)
+        finished = clusters.watch(plans, cluster, folder, name)
+    jobs = folders.jobs_of(plans)
     if not finished:
-        found = status(jobs, folder.attempts(jobs))
+        found = folders.status(jobs, folder.attempts(jobs))
         for row in found["failures"].values():
-            print(failure(row, folder.out), file=sys.stderr)
+            print(folders.failure(row, folder.out), file=sys.stderr)
         left = f"{len(jobs) - found['counts'].get('done', 0)} of {len(jobs)} jobs are not finished"
         retry = f"sweep retry {shlex.quote(str(folder.out))}" + (f" --executor {kind}" if kind != "local" else "")
         same = "" if kind == "local" else ", given this command's flags,"
@@ -156,13 +157,13 @@ def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
         out: Folder of the sweep.
         json: Print one JSON object.
     """
-    folder = SweepFolder(out)
-    jobs = jobs_of(folder.plans())
-    found = status(jobs, folder.attempts(jobs))
+    folder = folders.SweepFolder(out)
+    jobs = folders.jobs_of(folder.plans())
+    found = folders.status(jobs, folder.attempts(jobs))
     if json:
         show(found, True)
     else:
-        print(*in_lines(found, out), sep="\n")
+        print(*folders.in_lines(found, out), sep="\n")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,11 +177,11 @@ class RetryCommand(_ExecutorConfig):
 def retry(words: list[str], program: str) -> None:
     """Retry failed jobs."""
     config = parse_stage(RetryCommand, words, program)
-    folder = SweepFolder(config.out)
+    folder = folders.SweepFolder(config.out)
     plans = folder.plans_to_do()
     # Append a row instead of deleting some: other drivers may be reading the file.
-    for name, rows in folder.attempts(jobs_of(plans)).items():
-        if failed(rows):
+    for name, rows in folder.attempts(folders.jobs_of(plans)).items():
+        if folders.failed(rows):
             folder.forget(name)
     carry_out(plans, folder, config.executor, config.options)
 
@@ -203,13 +204,13 @@ def join(
         plan: Run only this plan's jobs; default: all plans in OUT/sweep/plans.
         jobs: Concurrent jobs on this machine; 0: as many as its GPUs take, or one without a GPU.
         jobs_per_gpu: Concurrent jobs per GPU.
-        threads: CPU threads per job; 0: its share of the cores.
+        threads: CPU threads per job; 0: OMP_NUM_THREADS if it is set, else its share of the cores.
         stack: Maximum fine-tunings that one process trains as a stack, in the place of one job.
     """
     options = LocalOptions(jobs, jobs_per_gpu, threads, stack)
     options.check()
-    folder = SweepFolder(out)
-    finished = Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
+    folder = folders.SweepFolder(out)
+    finished = driver.Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
     print("all jobs are finished" if finished else "no job can start now; `sweep status` shows what is left")
 
 
