@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from finetune.evaluation import Episode, episode_rows, evaluate, jobs_of, own_and_none
-from vd4rl_pomdp.agents import CARD, FILES, checksums, find_agent, write_rounded
-from vd4rl_pomdp.core.errors import UserError, refuse_number
+from vd4rl_pomdp.agents import CARD, checksums, find_agent, write_rounded
+from vd4rl_pomdp.core.errors import UserError, refuse_no_folder, refuse_number
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.tasks import MOST_EPISODES, TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.runs.files import Row, holds_anything, read_json, write_json
-from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.outputs import built, refuse_inside
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import read_run
 
@@ -31,6 +30,7 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
     refuse_inside(out)
+    refuse_no_folder(out)
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another --out")
     trained = read_run(run)
@@ -40,8 +40,8 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
     about = encoder.pretrain
     length = min(config["eval_length"], TASKS.named(about.task).decisions)
     under = own_and_none(CorruptionConfig.fill(about.corruption))
-    try:
-        write_rounded(run, out)
+    with built(out) as made:
+        write_rounded(run, made)
         card = {name: trained.labels[name] for name in LABELS} | {
             "data": trained.record["inputs"]["data"],
             "corruption": about.corruption,
@@ -57,16 +57,12 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
             "run": trained.id,
             "commit": trained.commit,
             "length": length,
-            "episodes": _played(out, trained.labels, length, under, episodes, workers),
+            "episodes": _played(made, trained.labels, length, under, episodes, workers),
             "render": render_info(about.task),
             "processor": machine("cpu")["processor"],
-            "sha256": checksums(out),
+            "sha256": checksums(made),
         }
-        write_json(out / CARD, card)
-    except BaseException:  # a signal, too: the same command must find the folder empty
-        for part in {name.partition("/")[0] for name in FILES}:
-            shutil.rmtree(out / part, ignore_errors=True)
-        raise
+        write_json(made / CARD, card)
     return card
 
 

@@ -1,7 +1,10 @@
 """Exported agents reproduce the episodes of their cards; damaged and unknown ones are rejected."""
 
 import io
+import multiprocessing
+import os
 import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+import finetune.export as finetune_export
 from finetune.evaluation import EVALUATION_SEED
 from finetune.export import replay_agent
 from finetune.train import finetune
@@ -67,7 +71,19 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
         with pytest.raises(SystemExit):
             main(["agents", "export", str(run), "--out", str(out)])
     assert "re-run the same command" in capsys.readouterr().err
-    main(["agents", "export", str(run), "--out", str(out), "--episodes", "2", "--workers", "1"])
+    assert not out.parent.exists()
+    words = ["agents", "export", str(run), "--out", str(out), "--episodes", "2", "--workers", "1"]
+
+    def killed() -> None:
+        finetune_export.evaluate = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+        main(words)
+
+    child = multiprocessing.get_context("fork").Process(target=killed)
+    child.start()
+    child.join()
+    assert (child.exitcode, out.exists()) == (-signal.SIGKILL, False), "a part of an agent is none"
+    main(words)
+    assert [path.name for path in out.parent.iterdir()] == ["mine"], "what the killed process left is gone"
     assert f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")' in capsys.readouterr().out
     agent = load_agent(str(out))
     card = agent.card

@@ -15,7 +15,7 @@ from tests.helpers_bad_input import rejection
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.runs.outputs import in_use, kept_in, owned, refuse_foreign, refuse_inside
+from vd4rl_pomdp.runs.outputs import built, in_use, kept_in, owned, refuse_foreign, refuse_inside
 
 
 def fill(folder: Path, **files: str) -> Path:
@@ -148,3 +148,20 @@ def test_folder_in_use_names_its_process_until_it_dies(tmp_path):
     with owned(tmp_path / "run"):
         assert in_use(tmp_path / "run")
     assert not list((tmp_path / "run").iterdir())
+
+
+def test_what_is_built_appears_whole_beside_the_hidden_files_that_were_there(tmp_path):
+    out = fill(tmp_path / "out", __DS_Store="of a file manager")
+    with built(out) as made:
+        fill(made, a="1")
+        assert [path.name for path in out.iterdir()] == [".DS_Store"]
+    assert sorted(path.name for path in out.iterdir()) == [".DS_Store", "a"]
+
+    def fail() -> None:
+        with built(tmp_path / "deep" / "other") as made:
+            fill(made, a="1")
+            raise UserError("no")
+
+    with pytest.raises(UserError, match="no"):
+        fail()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

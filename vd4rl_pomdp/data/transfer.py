@@ -6,12 +6,10 @@ the target and renamed at the end; an interrupted export starts over.
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,7 @@ from vd4rl_pomdp.data.formats.vd4rl import read_shards
 from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.runs.files import holds_anything
-from vd4rl_pomdp.runs.outputs import owned, refuse_inside
+from vd4rl_pomdp.runs.outputs import built, refuse_inside, removing_if_empty
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 _SHARD_ROWS = 5_000
@@ -89,7 +87,7 @@ def import_set(
         for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
-    with _removing_if_empty(out):
+    with removing_if_empty(out):
         try:
             collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
         except UserError:
@@ -112,8 +110,6 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another --out")
     opened = _resized(read_shards(str(path)), size)
-    absolute = Path(os.path.abspath(out))  # Minari loses the files of a relative path
-    hidden = absolute.with_name(f".{absolute.name}.export")
     progress = ProgressLine("export", opened.episodes, "episodes")
 
     def read(first: int) -> Iterator[EpisodeArrays]:
@@ -121,29 +117,9 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
             yield rows
             progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
-    # `owned` locks the hidden folder, so that no other process removes it
-    with _removing_if_empty(hidden, True), disk_errors(out), owned(hidden), progress:
-        shutil.rmtree(hidden / "set", ignore_errors=True)  # left by a killed process
-        try:
-            lost = form.write(hidden / "set", out, replace(opened, read=read))
-            if out.is_dir():
-                out.rmdir()
-            (hidden / "set").rename(out)
-        finally:
-            shutil.rmtree(hidden / "set", ignore_errors=True)
+    with disk_errors(out), built(out) as made, progress:
+        lost = form.write(made, out, replace(opened, read=read))
     _print(lost)
-
-
-@contextmanager
-def _removing_if_empty(folder: Path, ours: bool = False) -> Iterator[None]:
-    """On exit remove `folder` and its parents if empty and created in the block (`folder` always, if `ours`)."""
-    made = [one for one in (folder, *folder.parents) if not one.exists() or (ours and one == folder)]
-    try:
-        yield
-    finally:
-        with suppress(OSError):
-            for place in made:
-                place.rmdir()
 
 
 @contextmanager

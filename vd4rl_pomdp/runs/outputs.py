@@ -7,9 +7,10 @@ process writes, it holds a file lock, which the system releases when the process
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -107,6 +108,42 @@ def owned(folder: Path) -> Iterator[None]:
         # one. Deleted after the release, it could already be another owner's, and two processes would own the folder.
         (folder / LOCK).unlink(missing_ok=True)
         lock.release()
+
+
+@contextmanager
+def removing_if_empty(folder: Path, ours: bool = False) -> Iterator[None]:
+    """On exit remove `folder` and its parents if empty and created in the block (`folder` always, if `ours`)."""
+    made = [one for one in (folder, *folder.parents) if not one.exists() or (ours and one == folder)]
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()
+
+
+@contextmanager
+def built(out: Path) -> Iterator[Path]:
+    """Yield the absolute path of a folder to create, which becomes `out` at the end: `out` is never incomplete.
+
+    It lies in a hidden folder next to `out`, locked against other processes. If the block fails, nothing remains; what
+    a killed process leaves is replaced by the next one. `out` may exist if it holds nothing but hidden files.
+    """
+    absolute = Path(os.path.abspath(out))
+    hidden = absolute.with_name(f".{absolute.name}.export")
+    made = hidden / "new"
+    with removing_if_empty(hidden, True), owned(hidden):
+        shutil.rmtree(made, ignore_errors=True)
+        try:
+            yield made
+            with disk_errors(out):
+                if absolute.is_dir():
+                    for other in absolute.iterdir():
+                        other.rename(made / other.name)
+                    absolute.rmdir()
+                made.rename(absolute)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
 
 
 def in_use(folder: Path) -> bool:
