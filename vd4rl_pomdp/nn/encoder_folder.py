@@ -95,6 +95,8 @@ def load_encoder(
         with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
             encoder = Encoder(config)
         CorruptionConfig.of(**card.corruption).check()
+    except UserError as error:  # a part that nothing has registered here: the encoder itself may be whole
+        raise UserError(f"{folder}/config.json: describes no encoder ({error})") from error
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(
             f"{folder}/config.json: describes no encoder ({first_line(error)}); correct it, or pretrain it again"
