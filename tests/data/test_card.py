@@ -81,3 +81,10 @@ def test_card_escapes_markup_in_names(tmp_path):
     assert "<b>" not in text
     assert "<img" not in re.sub("(`+) .*? \\1", "", text), "only in the command, which is code"
     assert (folder / "card.png").stat().st_size > 5_000
+
+
+def test_a_set_of_ones_own_is_not_said_to_be_of_the_actor_with_its_qualitys_name(tmp_path):
+    own = write_fake_set(tmp_path / "own", attributes={"task": "walker_walk", "set": "expert"})
+    text = module.write_card(own).read_text()
+    assert "actor" not in text
+    assert "A published dataset, or one that records no origin." in text
