@@ -83,7 +83,7 @@ def test_card_escapes_markup_in_names(tmp_path):
     assert (folder / "card.png").stat().st_size > 5_000
 
 
-def test_a_set_of_ones_own_is_not_said_to_be_of_the_actor_with_its_qualitys_name(tmp_path):
+def test_card_of_a_user_set_does_not_name_the_actor_of_its_quality(tmp_path):
     own = write_fake_set(tmp_path / "own", attributes={"task": "walker_walk", "set": "expert"})
     text = module.write_card(own).read_text()
     assert "actor" not in text

@@ -46,7 +46,7 @@ def test_ids_pass_the_gymnasium_checker(name):
     env.close()
 
 
-def test_an_environment_passes_to_another_process():
+def test_environment_pickles_as_a_new_one():
     """As pickled by a worker that is spawned: one that has begun arrives as a new one."""
     env = make("WalkerWalk", corruption="patch+zero_frames", patch_size=24, frame_size=64)
     env.reset(seed=3)

@@ -150,7 +150,7 @@ def test_folder_in_use_names_its_process_until_it_dies(tmp_path):
     assert not list((tmp_path / "run").iterdir())
 
 
-def test_what_is_built_appears_whole_beside_the_hidden_files_that_were_there(tmp_path):
+def test_built_folder_appears_complete_and_keeps_hidden_files(tmp_path):
     out = fill(tmp_path / "out", __DS_Store="of a file manager")
     with built(out) as made:
         fill(made, a="1")

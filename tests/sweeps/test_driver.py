@@ -232,7 +232,7 @@ def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("threads", "expected"), [(0, "7"), (3, "3")])
-def test_a_jobs_threads_are_the_flags_then_those_of_the_environment(tmp_path, monkeypatch, threads, expected):
+def test_job_threads_come_from_the_flag_then_the_environment(tmp_path, monkeypatch, threads, expected):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     one = job(tmp_path, "one")
     assert Driver([keep_plan(tmp_path, one)], LocalOptions(threads=threads), SweepFolder(tmp_path)).run()

@@ -139,7 +139,7 @@ def test_folder_names_planned_by_another_grid_are_not_reused(tmp_path, capsys):
     assert plan(tmp_path, ["finetune.updates=30"], others=first) == first, "jobs of both grids are shared"
 
 
-def test_a_name_shows_the_corruption_that_a_where_sets_for_some_tasks(tmp_path):
+def test_folder_name_shows_corruption_options_set_by_where(tmp_path):
     grid = GRID.replace('task = "walker_walk"', 'task = ["walker_walk", "cheetah_run"]').split("[[block]]")[0]
     where = '[[where]]\nonly = ["task=cheetah_run"]\npretrain = { patch_size = 24, batch_size = 8 }\n'
     (tmp_path / "grid.toml").write_text(f'{grid}[[block]]\npretrain = {{ method = "acro" }}\n{where}')

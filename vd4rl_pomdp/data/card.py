@@ -79,7 +79,7 @@ def write_card(path: Path) -> Path:
     table |= memory or {"memory": NOT_CERTIFIED}
     lines = [f"| {name} | {markdown(str(value))} |" for name, value in table.items()]
     lines += [f"| {name} | {value} |" for name, value in _origin(path, attributes).items()]
-    collected = "policy" in attributes[0]  # a set of the user's own may have the quality's name
+    collected = "policy" in attributes[0]  # a user's dataset may share a quality's name
     how = HOW.get(names[1] or "", "") if collected else "A published dataset, or one that records no origin."
     if source := dict(attributes[0].get("imported", {})):
         how = f"Imported from {source.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in source.items()))}."
