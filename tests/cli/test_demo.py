@@ -96,8 +96,8 @@ def test_demo_runs_one_job_per_core_up_to_four(tmp_path, monkeypatch):
     monkeypatch.setattr(demos, "carry_out", carry_out)
     monkeypatch.setattr(demos, "play", lambda words, program: None)
     for gpus, cores in (([], 2), ([], 64), (["0"], 64)):
-        monkeypatch.setattr(demos, "visible_gpus", lambda gpus=gpus: gpus)
-        monkeypatch.setattr(demos, "count_workers", lambda wanted, cores=cores: wanted or cores)
+        monkeypatch.setattr("vd4rl_pomdp.sweeps.driver.visible_gpus", lambda gpus=gpus: gpus)
+        monkeypatch.setattr("vd4rl_pomdp.runs.workers.count_workers", lambda wanted, cores=cores: wanted or cores)
         with pytest.raises(SystemExit, match="2"):
             main(["demo", "--out", str(tmp_path)])
     assert at_once == [2, 4, 0]

@@ -5,15 +5,16 @@ from __future__ import annotations
 import itertools
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.sweeps.options import program_name
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from vd4rl_pomdp.data import card as cards
     from vd4rl_pomdp.data import check as checking
     from vd4rl_pomdp.data import collect as collection
@@ -21,6 +22,14 @@ with loaded_on_use():
     from vd4rl_pomdp.data import parity as pixels
     from vd4rl_pomdp.data import transfer
     from vd4rl_pomdp.report import browse
+else:
+    cards = Later("vd4rl_pomdp.data.card")
+    checking = Later("vd4rl_pomdp.data.check")
+    collection = Later("vd4rl_pomdp.data.collect")
+    published = Later("vd4rl_pomdp.data.download")
+    pixels = Later("vd4rl_pomdp.data.parity")
+    transfer = Later("vd4rl_pomdp.data.transfer")
+    browse = Later("vd4rl_pomdp.report.browse")
 
 REPLAY_TOLERANCE = 1e-6
 """Largest accepted difference between stored and replayed rewards; 0 on the machine that collected them."""

@@ -11,9 +11,10 @@ import time
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vd4rl_pomdp.cli.hub import play
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.cli.report import report
 from vd4rl_pomdp.cli.sweeps import carry_out
@@ -27,7 +28,7 @@ from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.options import LocalOptions
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from vd4rl_pomdp.report import load
     from vd4rl_pomdp.runs import workers
     from vd4rl_pomdp.studies.navigation import figures
@@ -35,6 +36,14 @@ with loaded_on_use():
     from vd4rl_pomdp.sweeps import driver
     from vd4rl_pomdp.sweeps import folder as folders
     from vd4rl_pomdp.sweeps import plan as planning
+else:
+    load = Later("vd4rl_pomdp.report.load")
+    workers = Later("vd4rl_pomdp.runs.workers")
+    figures = Later("vd4rl_pomdp.studies.navigation.figures")
+    mazes = Later("vd4rl_pomdp.studies.navigation.runs")
+    driver = Later("vd4rl_pomdp.sweeps.driver")
+    folders = Later("vd4rl_pomdp.sweeps.folder")
+    planning = Later("vd4rl_pomdp.sweeps.plan")
 
 GRIDS = {"runs": "quick"} | ({"navigation": "quick_navigation"} if find_spec("gymnasium_robotics") else {})
 """Grid by output folder; mazes only if their extra is installed."""

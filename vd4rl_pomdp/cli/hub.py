@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
 
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder
 from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from finetune import export as exporting
     from vd4rl_pomdp import hub
     from vd4rl_pomdp.report import films
+else:
+    exporting = Later("finetune.export")
+    hub = Later("vd4rl_pomdp.hub")
+    films = Later("vd4rl_pomdp.report.films")
 
 
 @command

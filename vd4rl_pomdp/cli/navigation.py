@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, parse, parse_stage
 from vd4rl_pomdp.cli.report import named
 from vd4rl_pomdp.runs import NAVIGATION_FILE
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from vd4rl_pomdp.studies.navigation import collect as mazes
     from vd4rl_pomdp.studies.navigation import config, drivers
     from vd4rl_pomdp.studies.navigation import report as reporting
     from vd4rl_pomdp.studies.navigation import train as objectives
+else:
+    mazes = Later("vd4rl_pomdp.studies.navigation.collect")
+    config = Later("vd4rl_pomdp.studies.navigation.config")
+    drivers = Later("vd4rl_pomdp.studies.navigation.drivers")
+    reporting = Later("vd4rl_pomdp.studies.navigation.report")
+    objectives = Later("vd4rl_pomdp.studies.navigation.train")
 
 
 def collect(words: list[str], program: str) -> None:

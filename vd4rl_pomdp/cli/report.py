@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.sweeps.grid import load_grid, narrow
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from finetune import evaluation
     from vd4rl_pomdp.report import compare as comparing
     from vd4rl_pomdp.report import load, page
     from vd4rl_pomdp.runs import results
     from vd4rl_pomdp.sweeps import members
+else:
+    evaluation = Later("finetune.evaluation")
+    comparing = Later("vd4rl_pomdp.report.compare")
+    load = Later("vd4rl_pomdp.report.load")
+    page = Later("vd4rl_pomdp.report.page")
+    results = Later("vd4rl_pomdp.runs.results")
+    members = Later("vd4rl_pomdp.sweeps.members")
 
 
 @command

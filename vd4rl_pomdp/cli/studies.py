@@ -5,17 +5,18 @@ from __future__ import annotations
 import json as json_library
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import refuse_no_folder
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_kept
 from vd4rl_pomdp.sweeps.options import LocalOptions, own_program, refuse_unknown_to_jobs
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from vd4rl_pomdp.bench import gpu as on_gpu
     from vd4rl_pomdp.bench import suite
     from vd4rl_pomdp.report import theory as theory_page
@@ -23,6 +24,14 @@ with loaded_on_use():
     from vd4rl_pomdp.studies import certify as certificates
     from vd4rl_pomdp.studies.theory import study as theory_study
     from vd4rl_pomdp.sweeps import folder as folders
+else:
+    on_gpu = Later("vd4rl_pomdp.bench.gpu")
+    suite = Later("vd4rl_pomdp.bench.suite")
+    theory_page = Later("vd4rl_pomdp.report.theory")
+    results_folder = Later("vd4rl_pomdp.runs.results")
+    certificates = Later("vd4rl_pomdp.studies.certify")
+    theory_study = Later("vd4rl_pomdp.studies.theory.study")
+    folders = Later("vd4rl_pomdp.sweeps.folder")
 
 
 @command

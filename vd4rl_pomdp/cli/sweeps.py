@@ -9,11 +9,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.later import loaded_on_use
+from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
@@ -28,10 +28,16 @@ from vd4rl_pomdp.sweeps.options import (
     refuse_unknown_to_jobs,
 )
 
-with loaded_on_use():
+if TYPE_CHECKING:
     from vd4rl_pomdp.sweeps import clusters, driver, stages
     from vd4rl_pomdp.sweeps import folder as folders
     from vd4rl_pomdp.sweeps import plan as planning
+else:
+    clusters = Later("vd4rl_pomdp.sweeps.clusters")
+    driver = Later("vd4rl_pomdp.sweeps.driver")
+    stages = Later("vd4rl_pomdp.sweeps.stages")
+    folders = Later("vd4rl_pomdp.sweeps.folder")
+    planning = Later("vd4rl_pomdp.sweeps.plan")
 
 
 @dataclass(frozen=True, kw_only=True)
