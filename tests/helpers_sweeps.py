@@ -87,8 +87,8 @@ def begun(job: Job) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def until(holds: Callable[[], object], seconds: float = 120.0) -> None:
-    """Wait until `holds()` is true."""
+def until(holds: Callable[[], object], seconds: float = 300.0) -> None:
+    """Wait until `holds()` is true; on a busy machine a Ray job takes minutes to start."""
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "timed out"

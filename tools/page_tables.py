@@ -13,6 +13,7 @@ from pathlib import Path
 import ladder_table as ladder
 import navigation_table as mazes
 import offline_table as offline
+import protocol_table as protocol
 
 from vd4rl_pomdp.core.errors import UserError
 
@@ -25,6 +26,7 @@ Tables = dict[str, Iterable[str]]
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, by the page's path in the repository."""
+    frozen = protocol.protocol_runs()
     methods, returns = offline.runs_of(["methods"], ["methods", "offline", "control"]), offline.main_runs()
     numbers, rungs, condition = mazes.numbers_in(), ladder.cells_in(), mazes.Condition("", "")
     by_k = [(f"K = {k}", condition._replace(max_k=k)) for k in (15, 1)]
@@ -51,6 +53,7 @@ def pages() -> dict[str, Tables]:
             "contrasts": offline.contrast_lines(returns),
             "aggregate": offline.aggregate_lines(returns),
         },
+        "protocol": {"methods": protocol.method_lines(frozen), "contrasts": protocol.contrast_lines(frozen)},
     }
     return {f"results/{place}/README.md": of_page for place, of_page in tables.items()}
 

@@ -218,7 +218,7 @@ def test_unrecorded_history_counts_as_the_methods_default(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("moved", "verdict"), [(0.05, "undecided at this budget"), (None, "convergence is not recorded")]
+    ("moved", "verdict"), [(0.05, "a critic had not converged"), (None, "convergence is not recorded")]
 )
 def test_claims_require_converged_critics(tmp_path, moved, verdict):
     write(tmp_path, GOOD | {("mik", "patch"): ()})
@@ -232,7 +232,7 @@ def test_claims_require_converged_critics(tmp_path, moved, verdict):
 def test_claim_against_all_methods_requires_each_critic(tmp_path):
     write(tmp_path, GOOD)
     rows = judged(write(tmp_path, {("driml", "patch"): (20, 22)}, moved=0.05))
-    assert (rows[FIRST]["right"], rows[FIRST]["verdict"]) == ("driml", "not judged: undecided at this budget")
+    assert (rows[FIRST]["right"], rows[FIRST]["verdict"]) == ("driml", "not judged: a critic had not converged")
     assert rows[ACTIONS]["verdict"] == "holds"
 
 

@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import contextmanager
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
@@ -183,6 +184,16 @@ finally:
 DRIVER = "from vd4rl_pomdp.sweeps import clusters; clusters.LOOK_S = 1.0; from vd4rl_pomdp.cli import main; main()"
 
 
+@contextmanager
+def killed_at_the_end(command, **run):
+    """A subprocess that a failed test does not wait for."""
+    with subprocess.Popen(command, **run) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
 def test_ray_sweep_finishes_after_node_failure_and_driver_stop(tmp_path):
     """Cluster and drivers are subprocesses, since a process that has used Ray cannot be forked."""
@@ -196,18 +207,19 @@ def test_ray_sweep_finishes_after_node_failure_and_driver_stop(tmp_path):
             address = next(line for line in cluster.stdout if line.startswith(("127.", "10.", "172.", "192."))).strip()
             words = f"sweep retry {tmp_path / 'out'} --executor ray --address {address} --cpus 1 --gpus 0"
             command = [sys.executable, "-c", DRIVER, *words.split()]
-            with subprocess.Popen(command, **run) as driver:
+            with killed_at_the_end(command, **run) as driver:
                 until(lambda: all(map(begun, jobs)))
                 assert begun(jobs[0])[0]["OMP_NUM_THREADS"] == "1"
                 driver.terminate()
                 assert driver.wait(60) == 143
-            with subprocess.Popen(command, **run) as driver:
+            with killed_at_the_end(command, **run) as driver:
                 until(lambda: all(len(begun(one)) == 2 for one in jobs))
                 print(file=cluster.stdin, flush=True)
                 (tmp_path / "out" / "go").touch()
                 assert driver.wait(120) == 0
             assert all(map(is_finished, jobs))
         finally:
+            (tmp_path / "out" / "go").touch()
             cluster.communicate("\n", timeout=60)
 
 

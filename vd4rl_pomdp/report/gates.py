@@ -38,7 +38,7 @@ data's mean return, whichever is smaller; ACRO_SHARE of the latter if no score i
 BASELINES = {"bc": "BC", "drq_bc": "DrQ+BC"}
 """V-D4RL's offline baselines from pixels, by column of `published_scores`."""
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
-NOT_RECORDED = "convergence is not recorded"
+NOT_RECORDED, NOT_CONVERGED = "convergence is not recorded", "a critic had not converged"
 GATED = (*SETTING, "algorithm")
 _place = itemgetter(*GATED)
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
@@ -369,7 +369,7 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
         return ""
     settled = converged([*compared.left, *compared.right])
     if unranked or not settled:
-        return f"{UNJUDGED}{NOT_RECORDED if settled is None and not unranked else FAILED}"
+        return f"{UNJUDGED}{FAILED if unranked else NOT_RECORDED if settled is None else NOT_CONVERGED}"
     p = row["p"] if row["adjusted_p"] is None else row["adjusted_p"]
     sign = HOLDS if row["difference"] > 0 else FAILS
     found = FEW if p is None else sign if p < stats.LEVEL else OPEN

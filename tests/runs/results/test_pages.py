@@ -26,7 +26,7 @@ GENERATED = re.compile(r"<!-- table: .* -->\n(?:\|.*\n)*")
 """Tables that scripts write; tests/tools/test_scripts.py compares them with the rows."""
 MAIN = ("control", "offline")
 """Folders whose rows are pooled."""
-ASIDE = ("control/budget", "control/histories", "control/expert")
+ASIDE = ("control/budget", "control/histories", "control/expert", "protocol")
 REPORTS = sorted(found.parent for found in (ROOT / "results" / "navigation").rglob("tables.csv"))
 MEASURES = (
     *(online_error(component).raw() for component in ("state", "position", "velocity")),
@@ -134,7 +134,9 @@ def unknown(text: str, known: set[str]) -> list[str]:
         ("docs/methods/acro.md", 6),
         ("docs/methods/ah.md", 1),
         ("docs/methods/supervised.md", 2),
+        ("results/README.md", 3),
         ("results/offline/README.md", 8),
+        ("results/protocol/README.md", 4),
         ("results/control/README.md", 11),
         ("results/gpu/README.md", 4),
         ("results/navigation/README.md", 7),
