@@ -217,9 +217,7 @@ def test_unrecorded_history_counts_as_the_methods_default(tmp_path):
     assert judged(tmp_path) == {}, "no acro with a GRU was run"
 
 
-@pytest.mark.parametrize(
-    ("moved", "verdict"), [(0.05, "a critic had not converged"), (None, "convergence is not recorded")]
-)
+@pytest.mark.parametrize(("moved", "verdict"), [(0.05, "unconverged critic"), (None, "convergence is not recorded")])
 def test_claims_require_converged_critics(tmp_path, moved, verdict):
     write(tmp_path, GOOD | {("mik", "patch"): ()})
     rows = judged(write(tmp_path, {("mik", "patch"): GOOD["mik", "patch"]}, moved=moved))
@@ -232,7 +230,7 @@ def test_claims_require_converged_critics(tmp_path, moved, verdict):
 def test_claim_against_all_methods_requires_each_critic(tmp_path):
     write(tmp_path, GOOD)
     rows = judged(write(tmp_path, {("driml", "patch"): (20, 22)}, moved=0.05))
-    assert (rows[FIRST]["right"], rows[FIRST]["verdict"]) == ("driml", "not judged: a critic had not converged")
+    assert (rows[FIRST]["right"], rows[FIRST]["verdict"]) == ("driml", "not judged: unconverged critic")
     assert rows[ACTIONS]["verdict"] == "holds"
 
 

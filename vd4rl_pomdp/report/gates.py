@@ -38,7 +38,7 @@ data's mean return, whichever is smaller; ACRO_SHARE of the latter if no score i
 BASELINES = {"bc": "BC", "drq_bc": "DrQ+BC"}
 """V-D4RL's offline baselines from pixels, by column of `published_scores`."""
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
-NOT_RECORDED, NOT_CONVERGED = "convergence is not recorded", "a critic had not converged"
+NOT_RECORDED, NOT_CONVERGED = "convergence is not recorded", "unconverged critic"
 GATED = (*SETTING, "algorithm")
 _place = itemgetter(*GATED)
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
