@@ -126,10 +126,10 @@ def training(seconds: float) -> Callable[[], dict[str, float]]:
         algorithm.update(batch)
 
     def measure() -> dict[str, float]:
-        start, updates = time.perf_counter(), 0
-        while (spent := time.perf_counter() - start) < seconds:
+        start, updates, spent = time.perf_counter(), 0, 0.0
+        while spent < seconds:  # at least one update, however busy the machine is
             algorithm.update(batch)
-            updates += 1
+            updates, spent = updates + 1, time.perf_counter() - start
         return {"updates_per_s": updates / spent}
 
     return measure
