@@ -64,7 +64,7 @@ def main_runs() -> list[Run]:
 
 
 def runs_of(grids: Sequence[str], folders: Sequence[str]) -> list[Run]:
-    """Finished fine-tuning runs of some grids, from results folders, since grids share cells."""
+    """Finished fine-tuning runs of some grids (names or TOML files), from results folders, since grids share cells."""
     cells = [cell for name in grids for cell in load_grid(name).cells()]
     found = load_runs([RESULTS / name for name in folders], choice=GridMembers(" and ".join(grids), cells))
     return [run for run in found if run.rows and run.finished]
@@ -124,9 +124,12 @@ def _mean_text(runs: list[Run]) -> str:
     """Mean return with interval, and the number of seeds if below three; a dash if there is none."""
     if not runs:
         return number(None)
-    returns = episodes_of(runs)
-    text = with_interval(returns.mean(), *(mean_interval(returns) or (None, None)), 0)
-    return text + (f" (n = {len(runs)})" if len(runs) < 3 else "")
+    return mean_text(episodes_of(runs)) + (f" (n = {len(runs)})" if len(runs) < 3 else "")
+
+
+def mean_text(returns: np.ndarray) -> str:
+    """Mean of (seeds, episodes) returns, with its interval if there is one."""
+    return with_interval(returns.mean(), *(mean_interval(returns) or (None, None)), 0)
 
 
 def _difference(runs: Sequence[Run], corruption: str, method: str, other: str, clean: bool) -> str:

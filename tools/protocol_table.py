@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
+from offline_table import CLEAN, mean_text
 
 from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.report.gates import EXPLORATORY, episodes_of, gates, judge_claims, unranked
-from vd4rl_pomdp.report.load import PROBES, Run, label, load_runs
-from vd4rl_pomdp.report.stats import mean_interval, number, with_interval
+from vd4rl_pomdp.report.load import PROBES, Run, label
+from vd4rl_pomdp.report.stats import number, with_interval
 from vd4rl_pomdp.runs.files import groups
-from vd4rl_pomdp.sweeps.grid import load_grid
-from vd4rl_pomdp.sweeps.members import GridMembers
-
-RESULTS = Path(__file__).parents[1] / "results"
-
-
-def protocol_runs() -> list[Run]:
-    """Finished fine-tuning runs of the protocol's grid."""
-    grid = str(RESULTS / "protocol.toml")
-    found = load_runs([RESULTS / "protocol"], choice=GridMembers("protocol", load_grid(grid).cells()))
-    return [run for run in found if run.rows and run.finished]
 
 
 def method_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -31,17 +20,13 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
     for place, here in groups(runs, lambda run: run.of(("task", "quality", "corruption"))).items():
         by_method = groups(here, lambda run: label(run.named))
         for name, mine in sorted(by_method.items(), key=lambda item: -episodes_of(item[1]).mean()):
-            both = _mean_text(mine), number(None) if place[2] == "none" else _mean_text(mine, clean=True)
+            clean = number(None) if place[2] == CLEAN else mean_text(episodes_of(mine, clean=True))
             probes = ", ".join(f"{np.mean([run.measures[probe] for run in mine]):.0f}" for probe in PROBES)
-            moved = f"{100 * max(run.measures['critic_moved'] or 0 for run in mine):.2f}%"
-            rows.append((", ".join(place), f"`{name}`", len(mine), *both, probes, moved))
+            moved = 100 * np.max(np.array([run.measures["critic_moved"] for run in mine], dtype=float))
+            cells = mean_text(episodes_of(mine)), clean, probes, f"{moved:.2f}%"
+            rows.append((", ".join(place), f"`{name}`", len(mine), *cells))
     head = ("setting", "method", "n", "return", "evaluated clean", "probe: pose, velocity", "critic moved at most")
     return table_lines(head, rows, (0, 1))
-
-
-def _mean_text(runs: list[Run], clean: bool = False) -> str:
-    returns = episodes_of(runs, clean)
-    return with_interval(returns.mean(), *(mean_interval(returns) or (None, None)), 0)
 
 
 def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
