@@ -25,8 +25,8 @@ from vd4rl_pomdp import __version__, agents
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line
 from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
-from vd4rl_pomdp.data.folder import is_shard_name, join_shards, shard_files, shard_paths, task_and_quality
-from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows
+from vd4rl_pomdp.data.folder import is_shard_name, read_set, shard_files, shard_paths, task_and_quality
+from vd4rl_pomdp.data.format import read_attributes
 from vd4rl_pomdp.nn.encoder_folder import (
     CARD,
     CONFIG,
@@ -185,9 +185,7 @@ def _checked(folder: Path, kind: str) -> list[Path]:
     if kind in _FILES:
         (load_encoder if kind == ENCODER else agents.load_agent)(folder)
         return [folder / name for name in _FILES[kind]]
-    shards = shard_paths(folder)
-    read_frame_size(shards)
-    join_shards(folder, shards, [read_rows(shard) for shard in shards])
+    shards = read_set(folder).shards
     kept = [p for p in folder.iterdir() if p.suffix in (".json", ".md", ".png") and not p.name.startswith(".")]
     return sorted([*shards, *(path for path in kept if path.name not in (CARD, LISTING))])
 

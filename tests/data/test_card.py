@@ -11,7 +11,7 @@ from vd4rl_pomdp.core.tasks import QUALITIES, SET_QUALITIES
 from vd4rl_pomdp.core.text import markdown
 from vd4rl_pomdp.data import card as module
 from vd4rl_pomdp.data.card import write_card
-from vd4rl_pomdp.data.folder import published_scores
+from vd4rl_pomdp.data.folder import published_scores, read_set
 
 MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
 
@@ -37,11 +37,9 @@ def test_card_lists_contents_and_origin(tmp_path):
         assert picture.width > 600
 
 
-def test_film_shows_episode_of_median_return(tmp_path):
+def test_film_shows_one_episode_across_shards(tmp_path):
     folder = write_fake_set(tmp_path / "set", (12, 30, 20), cuts=(40, 50), attributes=MADE)
-    shards = module.shard_paths(folder)
-    counts = [40, 10, 12]
-    film = module._film(shards, counts, np.array([0, 12, 42]), np.array([12, 30, 20]), np.array([0.0, 9.0, 5.0]))
+    film = module._film(read_set(folder), 2)
     assert film.shape == (module.FILM_FRAMES, 3, 84, 84)
     assert film[:, 0, 0, 0].tolist() == [2] * module.FILM_FRAMES  # the episode
     assert film[:, 2, 0, 0].tolist() == np.linspace(0, 19, module.FILM_FRAMES).astype(int).tolist()
@@ -58,7 +56,7 @@ def test_card_of_published_set_has_no_origin(tmp_path):
 def test_card_of_single_shard_is_rejected(tmp_path):
     folder = write_fake_set(tmp_path / "set", (12, 30, 20), cuts=(40, 50))
     with pytest.raises(UserError, match="describes a whole dataset"):
-        write_card(module.shard_paths(folder)[0])
+        write_card(folder / "0_fake.hdf5")
     assert not list(folder.glob("card.*"))
 
 

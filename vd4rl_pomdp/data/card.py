@@ -12,16 +12,15 @@ from matplotlib.figure import Figure
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.core.text import code, markdown, plain, write_text
-from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.folder import (
     PROVENANCE,
+    StoredSet,
     episode_returns,
-    join_shards,
     published_scores,
-    shard_paths,
+    read_set,
     task_and_quality,
 )
-from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows, read_some_frames
+from vd4rl_pomdp.data.format import read_some_frames
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words, read_certificates
 
@@ -51,20 +50,15 @@ def write_card(path: Path) -> Path:
     """Write `card.md`, whose path is returned, and `card.png`; UserError for a damaged, incomplete or read-only set."""
     if path.is_file():
         raise UserError(f"{path}: is a single file; a card describes a whole dataset: name its folder")
-    shards = shard_paths(path)
-    read_frame_size(shards)
-    parts = [read_rows(shard) for shard in shards]
-    rows = join_shards(path, shards, parts)
-    attributes = [read_attributes(shard) for shard in shards]
+    stored = read_set(path)
+    attributes = stored.attributes
     names = task_and_quality(path, attributes)
     title = ", ".join(name for name in names if name) or "data set"
-    starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
-    returns = episode_returns(rows["reward"], starts)
-    lengths = np.diff([*starts, len(rows["reward"])])
+    returns, lengths = episode_returns(stored.rows["reward"], stored.starts), stored.ends - stored.starts
     scores = [row["bc"] for row in published_scores() if (row["env"], row["dataset"]) == names]
     # plain behaviour cloning is the published score closest to the data's own mean return
     published = float(scores[0]) * SCORE_DIVISOR if scores else None
-    film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
+    film = _film(stored, int(np.argsort(returns)[len(returns) // 2]))
     table = {
         "episodes": len(returns),
         "rows": int(lengths.sum()),
@@ -91,18 +85,15 @@ def write_card(path: Path) -> Path:
     return path / "card.md"
 
 
-def _film(
-    shards: list[Path], counts: list[int], starts: np.ndarray, lengths: np.ndarray, returns: np.ndarray
-) -> np.ndarray:
-    """Evenly spaced frames (FILM_FRAMES, 3, S, S) of the episode with the median return."""
-    episode = int(np.argsort(returns)[len(returns) // 2])
-    rows = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
-    offsets = np.cumsum([0, *counts])
-    frames = []
-    for shard, first, stop in zip(shards, offsets, offsets[1:], strict=False):
-        inside = np.unique(rows[(rows >= first) & (rows < stop)])
+def _film(stored: StoredSet, episode: int) -> np.ndarray:
+    """Evenly spaced frames (FILM_FRAMES, 3, S, S) of an episode; fewer if it has fewer."""
+    rows = np.linspace(stored.starts[episode], stored.ends[episode] - 1, FILM_FRAMES).astype(int)
+    frames, first = [], 0
+    for shard, count in zip(stored.shards, stored.counts, strict=True):
+        inside = np.unique(rows[(rows >= first) & (rows < first + count)])
         if len(inside):
             frames.append(read_some_frames(shard, inside - first))
+        first += count
     return np.concatenate(frames)
 
 

@@ -18,10 +18,9 @@ import numpy as np
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.format import read_attributes
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows
 from vd4rl_pomdp.runs.files import read_json
 
-SUFFIXES = (".hdf5", ".h5")
 PLAN, PROVENANCE = "collection.json", "provenance.json"
 """Files that a collection writes before its first shard, and after its last one."""
 
@@ -68,7 +67,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
 
 def is_shard_name(name: str) -> bool:
     """Whether a file name is that of a shard; hidden files are not."""
-    return not name.startswith(".") and name.lower().endswith(SUFFIXES)
+    return not name.startswith(".") and name.lower().endswith((".hdf5", ".h5"))
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -84,8 +83,8 @@ def shard_paths(folder: Path) -> list[Path]:
     `10_mixed` follows `9_mixed`, and the two halves of a medium_expert folder are not interleaved.
 
     Raises:
-        UserError: there is no such folder or no shard in it, a number is missing or duplicated among shards of the
-            same name, its collection is unfinished, or it is only part of a published data set.
+        UserError: there is no such folder or no shard in it, shards of the same name are not numbered 0, 1, 2, ..., its
+            collection is unfinished, or it is only part of a published data set.
     """
     if folder.is_file():
         return [folder]
@@ -100,33 +99,28 @@ def shard_paths(folder: Path) -> list[Path]:
         hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a dataset there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
     _refuse_part(folder, shards)
-    alike: dict[str, dict[int | None, Path]] = defaultdict(dict)
-    for shard in sorted(shards):
-        rest, number = _shard_number(shard)
-        if twin := alike[rest].get(number):
-            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are the same shard; remove one")
-        alike[rest][number] = shard
-    for rest, found in alike.items():
-        numbers = sorted(number for number in found if number is not None)
-        if numbers != list(range(len(numbers))):
-            missing = min(set(range(len(numbers))) - set(numbers))
+    alike: dict[str, list[Path]] = defaultdict(list)
+    for shard in sorted(shards, key=_shard_order):
+        alike[_shard_number(shard)[0]].append(shard)
+    for group in alike.values():
+        numbers = [_shard_number(shard)[1] for shard in group]
+        if numbers not in ([-1], list(range(len(group)))):
             raise UserError(
-                f"{folder}: has the shard {numbers[-1]}{rest}, but not {missing}{rest}; download or collect it again, "
-                "or number the shards of your own dataset 0, 1, 2, ..."
+                f"{folder}: {', '.join(shard.name for shard in group)} are not numbered 0, 1, 2, ...; download or "
+                "collect what is missing again, remove copies, or renumber your own dataset"
             )
     return sorted(shards, key=_shard_order)
 
 
-def _shard_number(path: Path) -> tuple[str, int | None]:
-    """Split a shard's name into the rest and its leading number: 10_mixed -> ("_mixed", 10); None if there is none."""
-    number, rest = re.fullmatch(r"(\d*)(.*)", path.stem, re.DOTALL).groups()  # type: ignore[union-attr]
-    return rest, int(number) if number else None
+def _shard_number(path: Path) -> tuple[str, int]:
+    """Split a shard's name into the rest and its leading number: 10_mixed -> ("_mixed", 10); -1 if there is none."""
+    rest = path.stem.lstrip("0123456789")
+    return rest, int(path.stem.removesuffix(rest) or -1)
 
 
 def _shard_order(path: Path) -> tuple[list[tuple[int, str]], int]:
     rest, number = _shard_number(path)
-    words = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", rest)]
-    return words, -1 if number is None else number
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", rest)], number
 
 
 def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
@@ -168,26 +162,61 @@ def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices:
     return stored.pop() if stored else next(named, None)
 
 
-def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Concatenate the rows `parts`, from `read_rows`, of all shards of the data set at `path`.
+@dataclass(frozen=True)
+class StoredSet:
+    """A data set on disk: its shards in order, and everything in them except the frames."""
+
+    shards: list[Path]
+    frame_size: int
+    attributes: list[dict[str, Any]]
+    """What `write_shard` stored with each shard."""
+    counts: list[int]
+    """Rows of each shard."""
+    rows: dict[str, np.ndarray]
+    """Rows of all shards, as by `read_rows`."""
+
+    @property
+    def starts(self) -> np.ndarray:
+        """First row of every episode, (E,) int64."""
+        return np.flatnonzero(self.rows["step_type"] == StepType.FIRST)
+
+    @property
+    def ends(self) -> np.ndarray:
+        """One past the last row of every episode, (E,) int64."""
+        return np.append(self.starts[1:], len(self.rows["reward"]))
+
+
+def read_set(path: Path) -> StoredSet:
+    """Read and validate a data set, a folder or a single shard, except its frames.
 
     Raises:
-        UserError: the shards differ in dimensions or keys, a row neither starts an episode nor continues that of the
-            previous row, or the number of episodes differs from that in collection.json.
+        UserError: as by `shard_paths` and `read_rows`; the shards differ in dimensions, keys or frame size; a row
+            neither starts an episode nor continues that of the previous row; or the number of episodes differs from
+            that in collection.json.
     """
-    first, expected = shards[0], parts[0]
+    shards = shard_paths(path)
+    frame_size, parts = read_frame_size(shards), [read_rows(shard) for shard in shards]
     for shard, part in zip(shards, parts, strict=True):
-        if expected.keys() != part.keys():
-            key = min(expected.keys() ^ part.keys())
-            having, other = (shard, first) if key in part else (first, shard)
-            raise UserError(f"{having}: has {key!r} and {other.name} does not; keep one dataset per folder")
-        for key, value in part.items():
-            if value.shape[1:] != expected[key].shape[1:]:
-                widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
-                raise UserError(f"{shard}: {key!r} has {widths}; keep one dataset per folder")
-    starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
+        if differing := {key for key, _ in _widths(part) ^ _widths(parts[0])}:
+            raise UserError(
+                f"{shard}: {min(differing)!r} has other dimensions than in {shards[0].name}, or is only in one of "
+                "them; keep one dataset per folder"
+            )
+    counts = [len(part["reward"]) for part in parts]
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    step_type = rows["step_type"]
+    _check_episodes(shards, counts, rows["step_type"])
+    found = StoredSet(shards, frame_size, [read_attributes(shard) for shard in shards], counts, rows)
+    check_count(path, len(found.starts))
+    return found
+
+
+def _widths(rows: Mapping[str, np.ndarray]) -> set[tuple[str, tuple[int, ...]]]:
+    return {(key, value.shape[1:]) for key, value in rows.items()}
+
+
+def _check_episodes(shards: Sequence[Path], counts: Sequence[int], step_type: np.ndarray) -> None:
+    """Raise UserError for a row that neither starts an episode nor continues that of the previous row."""
+    starts = np.cumsum([0, *counts])
 
     def fail(row: int, what: str) -> None:
         shard = int(np.searchsorted(starts, row, side="right")) - 1
@@ -202,11 +231,9 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
     for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
         (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
         # without numbers, shards are assumed to be consecutive
-        adjacent = before is None or number is None or (rest == previous_rest and number == before + 1)
+        adjacent = -1 in (before, number) or (rest == previous_rest and number == before + 1)
         if step_type[row] != StepType.FIRST and not adjacent:
             fail(int(row), f"continues an episode, but not that of {previous.name}")
-    check_count(path, int((step_type == StepType.FIRST).sum()))
-    return rows
 
 
 def check_count(path: Path, episodes: int) -> None:

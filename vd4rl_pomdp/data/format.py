@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,7 +28,6 @@ from vd4rl_pomdp.runs.files import write_bytes
 
 FRAMES_KEY = "observation"
 _ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
-_OPTIONAL = "physics"
 _WRITTEN = {FRAMES_KEY: "uint8", "action": "float32", "step_type": "int64"}
 _ATTRIBUTE = "vd4rl_pomdp"
 _BLOCK_ROWS = 1024
@@ -164,31 +162,21 @@ def _open(path: Path) -> Iterator[h5py.File]:
     except UserError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
+        if "unable to lock file" in str(error) or "already open for write" in str(error):
             raise UnavailableError(
-                f"{path}: another program is writing it, or its disk does not support locks "
-                f"({os.strerror(error.errno).lower()}); close that program and re-run the same command, or set "
-                "HDF5_USE_FILE_LOCKING=FALSE to read without locks"
-            ) from error
-        if "already open for write" in str(error):
-            raise UnavailableError(
-                f"{path}: another program is writing it, or was killed while writing; close that program and re-run "
-                "the same command, or clear its flag with `h5clear -s`"
+                f"{path}: another program is writing it or was killed while writing, or its disk does not support "
+                "locks; close that program and re-run the same command, clear the file's flag with `h5clear -s`, or "
+                "set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
             ) from error
         damaged = UserError(f"{path}: is truncated, damaged or not an HDF5 file ({in_one_line(error)}); {_REPAIR}")
         raise system_error(path, error) or damaged from error
 
 
 def _keys(path: Path, file: h5py.File) -> list[str]:
-    """Keys of the format that are in a file; UserError if one is missing, no array, or stored in another file."""
-    keys = [k for k in (FRAMES_KEY, *_ROW_KEYS) if k != _OPTIONAL or file.get(k, getlink=True) is not None]
+    """Keys of the format that are in a file; UserError if one is missing or no array."""
+    keys = [key for key in (FRAMES_KEY, *_ROW_KEYS) if key != "physics" or key in file]
     for key in keys:
-        external = isinstance(file.get(key, getlink=True), h5py.ExternalLink)
-        stored = file[key] if not external and key in file else None  # `file.get` hides a failing disk
-        if isinstance(stored, h5py.Dataset):
-            external = stored.external is not None or stored.is_virtual
-        if external:
-            raise UserError(f"{path}: {key!r} is stored in another file, which is not supported; {_REPAIR}")
+        stored = file[key] if key in file else None  # `file.get` hides a failing disk
         if not isinstance(stored, h5py.Dataset) or stored.shape is None:  # HDF5's null datasets have no shape
             raise UserError(f"{path}: has no {key!r}, so it is not a V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
     return keys

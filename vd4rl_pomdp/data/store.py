@@ -9,7 +9,6 @@ to a hidden folder and renames it at the end, under a file lock. The cache may b
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
@@ -17,20 +16,21 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
-from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_error, disk_errors, distinct_texts, system_error
+from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_errors, system_error
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.folder import check_count, join_shards, shard_paths
-from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
+from vd4rl_pomdp.data.folder import check_count, read_set, shard_paths
+from vd4rl_pomdp.data.format import read_frames
 from vd4rl_pomdp.runs.files import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
 
@@ -106,8 +106,10 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     folder = (cache or default_cache()) / key
     meta = _read_meta(folder)
     if meta is None:
-        with _locked(folder):
-            meta = _read_meta(folder) or _decode(path, shards, folder)
+        with disk_errors(folder.parent):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder.with_suffix(".lock")):  # one process decodes, the others wait for it
+                meta = _read_meta(folder) or _decode(path, folder)
     store = Store(folder, meta)
     check_count(path, int((store.array("step_type") == StepType.FIRST).sum()))  # collection.json is not in the key
     return store
@@ -134,54 +136,30 @@ def _read_meta(folder: Path) -> dict[str, Any] | None:
     return meta if all(path.is_file() and path.stat().st_size == size for path, size in files) else None
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for decoding, so that one process decodes and the others wait for it."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        # The lock file is never removed: else two processes could lock different files of the same name.
-        file = folder.with_suffix(".lock").open("w", encoding="utf-8")
-    except OSError as error:
-        raise disk_error(folder.parent, error) from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX)
-        except OSError as error:
-            raise type(disk_error(folder, error))(
-                f"{folder.parent}: this disk locks no files ({error.strerror}); set VD4RL_POMDP_CACHE to a folder on a "
-                "local one"
-            ) from error
-        yield
-
-
-def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
+def _decode(path: Path, folder: Path) -> dict[str, Any]:
     """Decode into a hidden folder, then rename it; leftovers of a killed process are removed first."""
-    frame_size = read_frame_size(shards)
-    rows = join_shards(path, shards, [read_rows(shard) for shard in shards])
+    stored = read_set(path)
     scratch = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         scratch.mkdir()
-        count = len(rows["reward"])
-        size, free = count * 3 * frame_size**2, shutil.disk_usage(scratch).free
+        count = len(stored.rows["reward"])
+        size, free = count * 3 * stored.frame_size**2, shutil.disk_usage(scratch).free
         if size > free:
-            needed, available = distinct_texts(size / 1e9, free / 1e9, 1)
             raise DiskFullError(
-                f"{folder.parent}: decoding needs {needed} GB, the disk has {available} GB; "
-                "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
+                f"{folder.parent}: decoding needs {size:,} bytes, the disk has {free:,}; free some space or set "
+                "VD4RL_POMDP_CACHE to a folder on another disk"
             )
-        _write_frames(shards, scratch / _FRAMES, count)
-        for key, value in rows.items():
+        _write_frames(stored.shards, scratch / _FRAMES, count)
+        for key, value in stored.rows.items():
             np.save(scratch / f"{key}.npy", value)
         files = {p.name: {"bytes": p.stat().st_size, "blake2b": _checksum(p)} for p in sorted(scratch.iterdir())}
-        attributes = [read_attributes(shard) for shard in shards]
-        meta = {"rows": count, "shards": [s.name for s in shards], "attributes": attributes, "files": files}
+        names = [shard.name for shard in stored.shards]
+        meta = {"rows": count, "shards": names, "attributes": stored.attributes, "files": files}
         (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
         # The last step, so that a killed process leaves no incomplete folder.
         scratch.rename(folder)
-    except OSError as error:
-        raise disk_error(folder.parent, error) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return meta

@@ -15,8 +15,8 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, in_one_line
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.folder import join_shards, shard_paths, task_and_quality
-from vd4rl_pomdp.data.format import FRAMES_KEY, read_attributes, read_frame_size, read_frames, read_rows
+from vd4rl_pomdp.data.folder import read_set, task_and_quality
+from vd4rl_pomdp.data.format import FRAMES_KEY, read_frames
 from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chosen
 from vd4rl_pomdp.data.shards import EpisodeArrays
 
@@ -24,27 +24,24 @@ from vd4rl_pomdp.data.shards import EpisodeArrays
 def read_shards(path: str, picture: str | None = None) -> SourceSet:
     """Open a data set in this package's format; reading holds at most one episode and one block in memory."""
     folder = Path(path)
-    shards = shard_paths(folder)
-    size = read_frame_size(shards)
+    stored = read_set(folder)
+    size, ends = stored.frame_size, stored.ends
     chosen({FRAMES_KEY: (3, size, size)}, picture)
-    rows = join_shards(folder, shards, [read_rows(shard) for shard in shards])
-    starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
-    ends = np.append(starts[1:], len(rows["reward"]))
 
     def read(first: int) -> Iterator[EpisodeArrays]:
         episode, begin, held = 0, 0, np.zeros((0, 3, size, size), np.uint8)
-        for block in (block for shard in shards for block in read_frames(shard)):
+        for block in (block for shard in stored.shards for block in read_frames(shard)):
             held = np.concatenate([held, block]) if len(held) else block
             while episode < len(ends) and ends[episode] <= begin + len(held):
-                start, end = starts[episode], ends[episode]
+                end = ends[episode]
                 if episode >= first:
-                    yield {FRAMES_KEY: held[start - begin : end - begin]} | {k: v[start:end] for k, v in rows.items()}
+                    rows = {key: value[begin:end] for key, value in stored.rows.items()}
+                    yield {FRAMES_KEY: held[: end - begin]} | rows
                 held, begin, episode = held[end - begin :], end, episode + 1
 
-    attributes = [read_attributes(shard) for shard in shards]
-    task, quality = task_and_quality(folder, attributes)
-    record = {"set": folder.resolve().name, "bytes": sum(shard.stat().st_size for shard in shards)}
-    return SourceSet(len(starts), len(rows["reward"]), (size, size), read, record, task=task, quality=quality)
+    task, quality = task_and_quality(folder, stored.attributes)
+    record = {"set": folder.resolve().name, "bytes": sum(shard.stat().st_size for shard in stored.shards)}
+    return SourceSet(len(ends), int(ends[-1]), (size, size), read, record, task=task, quality=quality)
 
 
 def read_npz(path: str, picture: str | None = None) -> SourceSet:
