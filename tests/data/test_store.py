@@ -186,7 +186,8 @@ def test_collected_set_with_missing_episodes_is_rejected(tmp_path, cache, unit):
 
 
 @pytest.mark.parametrize(
-    ("second", "key"), [({"action_dim": 5, "physics_dim": 3}, "action"), ({"physics_dim": 4}, "physics"), ({}, "physics")]
+    ("second", "key"),
+    [({"action_dim": 5, "physics_dim": 3}, "action"), ({"physics_dim": 4}, "physics"), ({}, "physics")],
 )
 def test_shards_of_different_sets_are_rejected(tmp_path, cache, second, key):
     write_fake_set(tmp_path / "set", (4,), physics_dim=3, names=["0_a.hdf5"])
@@ -210,7 +211,7 @@ def test_frame_size_is_read_from_shards(tmp_path, cache, size):
     for _ in range(2):
         np.testing.assert_array_equal(open_store(tmp_path / "set", cache).frames(), frames)
     with_frames(tmp_path / "set", 84, number=1)
-    with pytest.raises(UserError, match=rf"1_fake.hdf5: has frames of 84x84 pixels, 0_fake.hdf5 of {size}x{size}; keep"):
+    with pytest.raises(UserError, match=rf"1_fake.hdf5: has frames of 84x84 pixels, 0_fake.hdf5 of {size}x{size}"):
         open_store(tmp_path / "set", cache)
 
 

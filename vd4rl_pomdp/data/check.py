@@ -86,14 +86,13 @@ def _replayed(dataset: Dataset) -> tuple[float | None, str]:
     else:
         from vd4rl_pomdp.envs import dmc
 
-        dataset.require_states()
-        assert dataset.task is not None
-        task = TASKS.named(dataset.task)
+        _, name = dataset.require_states()
+        task = TASKS.named(name)
         if not isinstance(task, DMCTask):
-            return None, f"impossible: {dataset.task} is not a task of dm_control"
+            return None, f"impossible: {name} is not a task of dm_control"
         if not dmc.replays(task):
-            return None, f"impossible: {dataset.task} draws more than the simulator state for each episode"
-        stored, replay = dataset.store.array("reward"), partial(dmc.replay_rewards, dataset.task)
+            return None, f"impossible: {name} draws more than the simulator state for each episode"
+        stored, replay = dataset.store.array("reward"), partial(dmc.replay_rewards, name)
     action, worst = dataset.store.array("action"), 0.0
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
         if end - start == 1:

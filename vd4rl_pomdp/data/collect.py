@@ -40,7 +40,6 @@ from vd4rl_pomdp.runs.workers import run_jobs
 
 Collector = Actor | Ladder | None
 """Policy of a shard: an actor, a ladder of actors, or None for random actions."""
-_RUNTIME_FIELDS = ("out", "workers")
 MAX_NOISE = 2.0
 """Largest standard deviation of action noise; beyond this, actions in [-1, 1] would be all noise."""
 
@@ -123,7 +122,7 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
 
 def collection(config: CollectConfig) -> dict[str, Any]:
     """Settings that identify a data set; its collection.json holds them together with its actors' hashes."""
-    settings = {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
+    settings = {name: value for name, value in jsonable(asdict(config)).items() if name not in ("out", "workers")}
     if config.frame_size == FRAME_SIZE:
         settings["frame_size"] = None  # as in older files, which do not state it
     return settings

@@ -106,14 +106,15 @@ class Dataset:
     def action_dim(self) -> int:
         return self.action.shape[1]
 
-    def require_states(self) -> None:
-        """Raise UserError if the data set has no simulator states, or its task is unknown."""
+    def require_states(self) -> tuple[np.ndarray, str]:
+        """Simulator states (N, P) float64 and the task's name; UserError if the data set lacks one of them."""
         if self.physics is None:
             raise UserError(
                 f"{self.path}: stores no simulator states; `data collect` stores those of dm_control's tasks"
             )
         if self.task is None:
             raise UserError(f"{self.path}: has physics but no task name; put it in a folder named after its task")
+        return self.physics, self.task
 
     def rows_of(self, episode: int | range) -> slice:
         """Rows of one episode, or of a range of consecutive episodes."""
@@ -122,18 +123,14 @@ class Dataset:
 
     def states(self) -> Tensor:
         """Poses and velocities (N, P') float32, on the data set's device; UserError if it has no states."""
-        self.require_states()
-        assert self.physics is not None
-        assert self.task is not None
-        return torch.from_numpy(layout_of(TASKS.named(self.task)).visible_state(self.physics)).to(self.t.device)
+        physics, task = self.require_states()
+        return torch.from_numpy(layout_of(TASKS.named(task)).visible_state(physics)).to(self.t.device)
 
     def state_scale(self) -> StateScale:
         """Means and standard deviations of `states`, on the CPU; UserError if the data set has no states."""
-        states = self.states().cpu()
-        assert self.physics is not None
-        assert self.task is not None
-        pose = layout_of(TASKS.named(self.task)).pose(self.physics[:1])
-        return StateScale.fit(states, pose.shape[1])
+        physics, task = self.require_states()
+        pose = layout_of(TASKS.named(task)).pose(physics[:1])
+        return StateScale.fit(self.states().cpu(), pose.shape[1])
 
     def to(self, device: torch.device | str) -> Dataset:
         """Move frames and rows to a device, in place; UserError if its memory is too small."""

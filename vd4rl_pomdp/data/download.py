@@ -18,13 +18,12 @@ from vd4rl_pomdp.data.folder import RemoteFile, manifest
 from vd4rl_pomdp.runs.files import sha256
 from vd4rl_pomdp.runs.outputs import owned, refuse_kept
 
-HUB = "https://huggingface.co"
 REPOSITORY = "conglu/vd4rl"
 
 
 def default_endpoint() -> str:
     """Address of the Hub: HF_ENDPOINT if set, as in huggingface_hub, else https://huggingface.co."""
-    return os.environ.get("HF_ENDPOINT") or HUB
+    return os.environ.get("HF_ENDPOINT") or "https://huggingface.co"
 
 
 def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:

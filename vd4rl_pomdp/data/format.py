@@ -176,7 +176,7 @@ def _keys(path: Path, file: h5py.File) -> list[str]:
     """Keys of the format that are in a file; UserError if one is missing or no array."""
     keys = [key for key in (FRAMES_KEY, *_ROW_KEYS) if key != "physics" or key in file]
     for key in keys:
-        stored = file[key] if key in file else None  # `file.get` hides a failing disk
-        if not isinstance(stored, h5py.Dataset) or stored.shape is None:  # HDF5's null datasets have no shape
+        # not `file.get`, which hides a failing disk; HDF5's null datasets have no shape
+        if key not in file or not isinstance(stored := file[key], h5py.Dataset) or stored.shape is None:
             raise UserError(f"{path}: has no {key!r}, so it is not a V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
     return keys

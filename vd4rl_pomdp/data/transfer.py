@@ -87,11 +87,12 @@ def import_set(
         for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
+    new = not holds_anything(out)
     with removing_if_empty(out):
         try:
             collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
         except UserError:
-            if episodes.called and not any(shard.path.exists() for shard in shards):
+            if new and not any(shard.path.exists() for shard in shards):
                 (out / PLAN).unlink(missing_ok=True)
             raise
     _print(episodes.notes())
@@ -146,10 +147,8 @@ class _Reader:
         self._layout: dict[str, tuple[int, ...]] = {}
         self._last = np.zeros(0, np.uint8)  # last image of the previous episode
         self._clipped = self._read = self._still = self._joined = 0
-        self.called = False
 
     def __call__(self, number: int) -> EpisodeArrays:
-        self.called = True
         with _errors_of(f"{self._name}: episode {number}"):
             if number != self._next:
                 self._episodes = self._source.read(number)

@@ -24,24 +24,13 @@ from vd4rl_pomdp.envs.pixels import Render
 try:
     with gl_errors():  # both load the OpenGL library named by MUJOCO_GL and fail in many ways if it is missing
         import mujoco
-        from dm_control import suite
+        from dm_control import suite as suite  # for the other modules
         from dm_control.mujoco import Camera
 except ImportError as _error:
     if _error.name == "dm_control":
         raise UserError("dm-control is not installed: `pip install --no-deps dm-control==1.0.44`") from _error
     raise
 keep_display()
-
-__all__ = [
-    "FrameCamera",
-    "Render",
-    "check_mujoco",
-    "frames_hash",
-    "gl_strings",
-    "mujoco",
-    "prepare",
-    "suite",
-]
 
 _SKYBOX = Path(__file__).parent / "assets" / "skybox.npz"
 TRIED_MUJOCO = ((3, 3), (3, 18))
