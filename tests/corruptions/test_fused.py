@@ -39,44 +39,33 @@ def seen(dataset: Dataset, config: CorruptionConfig, **settings) -> list[torch.T
     return [view.observe(part).cpu().clone() for part in (rows, rows.flip(0), rows[1])]
 
 
-def assert_fused_equals_staged(dataset: Dataset, monkeypatch, config: CorruptionConfig, **settings) -> None:
-    """Assert that both implementations give the same pixels."""
-    expected = seen(dataset, config, **settings)
-    with monkeypatch.context() as m:
-        m.setattr(hardware, "in_host_memory", lambda x: False)
-        found = seen(dataset, config, **settings)
-    for one, other in zip(expected, found, strict=True):
-        assert torch.equal(one, other)
-
-
-@pytest.mark.parametrize("name", CORRUPTIONS)
-@pytest.mark.parametrize("options", OPTIONS)
-@pytest.mark.parametrize("mode", ["resample", "emission"])
-def test_fused_observations_equal_staged_ones(dataset, monkeypatch, name, options, mode):
-    config = CorruptionConfig.fill({"corruption": name, "corruption_mode": mode} | options)
-    for pad in (0, 4, 16):
-        for shared in ("window", "observation"):
-            assert_fused_equals_staged(dataset, monkeypatch, config, shift=pad, shared=shared)
-
-
+SETTINGS = [{"shift": pad, "shared": shared} for pad in (0, 4, 16) for shared in ("window", "observation")]
 DROPS = [
     ("zero_frames", {"zeroed_frames": 1, "keep_newest": True}),
     ("patch+zero_frames", {"zeroed_frames": 2, "keep_newest": True, "patch_size": 5, "patch_fill": 7}),
     ("truncate", {}),
     ("patch+truncate", {"kept": "oldest", "patch_size": 5, "patch_fill": 255}),
 ]
+CASES = [*((name, options) for name in CORRUPTIONS for options in OPTIONS), *DROPS]
 
 
-@pytest.mark.parametrize(("name", "options"), DROPS)
-def test_fused_frame_drops_equal_staged_ones(dataset, monkeypatch, name, options):
-    for pad in (0, 4):
-        assert_fused_equals_staged(dataset, monkeypatch, CorruptionConfig.of(name, **options), shift=pad)
-
-
-def test_fused_observations_of_any_stack_size(dataset, monkeypatch):
-    config = CorruptionConfig.of("patch+zero_frames", zeroed_frames=1, patch_size=4)
-    for stack in (1, 2, 5):
-        assert_fused_equals_staged(dataset, monkeypatch, config, shift=3, frame_stack=stack)
+@pytest.mark.parametrize(
+    ("name", "options", "settings"),
+    [
+        *((name, options, SETTINGS) for name, options in CASES),
+        ("patch+zero_frames", {"corruption_mode": "emission", "patch_size": 5}, SETTINGS),
+        *(
+            ("patch+zero_frames", {"zeroed_frames": 1, "patch_size": 4}, [{"shift": 3, "frame_stack": stack}])
+            for stack in (1, 2, 5)
+        ),
+    ],
+)
+def test_fused_observations_equal_staged_ones(dataset, monkeypatch, name, options, settings):
+    config = CorruptionConfig.fill({"corruption": name} | options)
+    expected = [seen(dataset, config, **one) for one in settings]
+    monkeypatch.setattr(hardware, "in_host_memory", lambda x: False)
+    for one, batches in zip(settings, expected, strict=True):
+        assert all(map(torch.equal, seen(dataset, config, **one), batches)), one
 
 
 def test_ranks_break_ties_as_sorting_does(monkeypatch):
@@ -119,17 +108,16 @@ def test_compile_failure_warns_once(monkeypatch, capsys):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(("name", "options"), [*((name, one) for name in CORRUPTIONS for one in OPTIONS), *DROPS])
+@pytest.mark.parametrize(("name", "options"), CASES)
 def test_gpu_observations_equal_cpu_observations(dataset, capsys, name, options):
     config = CorruptionConfig.fill({"corruption": name} | options)
-    for settings in ({"shift": 0}, {"shift": 4}, {"shift": 4, "shared": "observation"}, {"shift": 16}):
+    for settings in SETTINGS:
         here = seen(dataset, config, **settings)
         try:
             there = seen(dataset.to("cuda"), config, **settings)
         finally:
             dataset.to("cpu")
-        for one, other in zip(here, there, strict=True):
-            assert torch.equal(one, other)
+        assert all(map(torch.equal, here, there)), settings
     assert "not compiled" not in capsys.readouterr().err
 
 

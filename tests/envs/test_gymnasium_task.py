@@ -42,16 +42,13 @@ class Counter(gymnasium.Env):
 
 def play(task, decisions, **options):
     env = make_env(task, **options)
-    rows = [env.reset(0)]
-    for _ in range(decisions):
-        rows.append(env.step(np.zeros(2, np.float32)))
-    return env, rows
+    return [env.reset(0), *(env.step(np.zeros(2, np.float32)) for _ in range(decisions))]
 
 
 @pytest.mark.parametrize("pixels", ["render", "observation"])
 @pytest.mark.parametrize("shape", [(20, 30), (20, 30, 1), (20, 30, 3), (3, 20, 30), (1, 20, 30), (16, 16, 3)])
 def test_images_of_any_layout_become_frames(pixels, shape):
-    _, rows = play(GymnasiumTask(Counter, {"shape": shape}, pixels=pixels), 2, size=16)
+    rows = play(GymnasiumTask(Counter, {"shape": shape}, pixels=pixels), 2, size=16)
     for t, row in enumerate(rows):
         assert (row.frame.dtype, row.frame.shape) == (np.uint8, (3, 16, 16))
         assert (row.frame == t).all()
@@ -86,44 +83,38 @@ class OneBuffer(Counter):
 
 @pytest.mark.parametrize("shape", [(3, 16, 16), (16, 16, 3), (16, 16)])
 def test_frames_are_copied_from_reused_buffers(shape):
-    _, rows = play(GymnasiumTask(OneBuffer, {"shape": shape}, pixels="observation"), 2, size=16)
-    for t, row in enumerate(rows):
+    for t, row in enumerate(play(GymnasiumTask(OneBuffer, {"shape": shape}, pixels="observation"), 2, size=16)):
         assert (row.frame == t).all()
         assert row.frame.flags.c_contiguous
 
 
 def test_gymnasium_frames_do_not_depend_on_other_environments():
     """Gymnasium renders into the current OpenGL context if the environment has one viewer."""
-
-    def three_frames(between=lambda: None):
-        env = make_env(GymnasiumTask("HalfCheetah-v5"))
-        env.reset(1)
-        frames = []
-        for _ in range(3):
-            between()
-            frames.append(env.step(np.ones(6, np.float32)).frame)
-        return np.stack(frames)
-
     others = []
 
-    def draw_a_walker():
-        others.append(make_env(TASKS["walker_walk"]))
-        others[-1].reset(1)
+    def three_frames(disturbed):
+        env = make_env(GymnasiumTask("HalfCheetah-v5"))
+        env.reset(1)
+        for _ in range(3):
+            if disturbed:
+                others.append(make_env(TASKS["walker_walk"]))
+                others[-1].reset(1)
+            yield env.step(np.ones(6, np.float32)).frame
 
-    expected = three_frames()
+    expected = list(three_frames(False))
     assert (expected[0] != expected[-1]).any()
-    np.testing.assert_array_equal(three_frames(draw_a_walker), expected)
+    np.testing.assert_array_equal(list(three_frames(True)), expected)
 
 
 def test_actions_are_repeated_and_rewards_summed():
-    _, rows = play(GymnasiumTask(Counter, action_repeat=3), 2)
+    rows = play(GymnasiumTask(Counter, action_repeat=3), 2)
     assert [row.reward for row in rows] == [0, 1 + 2 + 3, 4 + 5 + 6]
     assert (rows[2].frame == 6).all()
 
 
 @pytest.mark.parametrize(("truncates", "discount"), [(False, 0.0), (True, 1.0)])
 def test_episode_end_within_action_repeat(truncates, discount):
-    _, rows = play(GymnasiumTask(Counter, {"end": 5, "truncates": truncates}, action_repeat=3), 2)
+    rows = play(GymnasiumTask(Counter, {"end": 5, "truncates": truncates}, action_repeat=3), 2)
     assert [row.step_type for row in rows] == [StepType.FIRST, StepType.MID, StepType.LAST]
     assert [row.discount for row in rows] == [1.0, 1.0, discount]
     assert rows[2].terminated != truncates
@@ -146,7 +137,7 @@ def test_actions_are_scaled_and_reshaped(low, high):
 def test_environment_is_made_by_id_and_arguments():
     gymnasium.register("vd4rl_pomdp_test/Counter-v0", entry_point=Counter, max_episode_steps=4)
     try:
-        _, rows = play(GymnasiumTask("vd4rl_pomdp_test/Counter-v0", {"end": 9}), 4)
+        rows = play(GymnasiumTask("vd4rl_pomdp_test/Counter-v0", {"end": 9}), 4)
         assert (rows[4].last, rows[4].discount) == (True, 1.0), "the environment's time limit truncates"
     finally:
         gymnasium.registry.pop("vd4rl_pomdp_test/Counter-v0")
@@ -172,15 +163,12 @@ def test_unsupported_environments_are_rejected(arguments, message):
 
 @pytest.mark.parametrize("place", ["reset", "step", "render"])
 def test_late_missing_dependency_is_reported(place):
-    class Needy(Counter):
-        pass
-
     def refuse(self, *arguments, **options):
         raise gymnasium.error.DependencyNotInstalled("pygame is not installed,\nrun `pip install pygame`")
 
-    setattr(Needy, place, refuse)
+    needy = type("Needy", (Counter,), {place: refuse})
     with pytest.raises(UserError, match=r"Needy cannot .* \(pygame is not installed, run `pip .* install what"):
-        play(GymnasiumTask(Needy), 1)
+        play(GymnasiumTask(needy), 1)
 
 
 def test_termination_and_truncation_are_distinguished():
@@ -194,10 +182,6 @@ def test_termination_and_truncation_are_distinguished():
             assert info["physics"].shape == (0,)
             assert env.step(np.zeros(2, np.float32))[2:4] == (False, False)
             assert env.step(np.zeros(2, np.float32))[2:4] == ends
-        with pytest.raises(UserError, match="patch size 17 exceeds the image"):
-            GymEnv(name, corruption="patch", patch_size=17, frame_size=16)
-        with pytest.raises(UserError, match="--frame-size is 8"):
-            GymEnv(name, frame_size=8)
 
 
 def test_terminating_dm_control_task_has_discount_0(monkeypatch):
@@ -208,22 +192,13 @@ def test_terminating_dm_control_task_has_discount_0(monkeypatch):
     assert (row.last, row.discount, row.terminated) == (True, 0.0, True)
 
 
-class Seedless(Counter):
-    def reset(self):
-        return super().reset()
-
-
-class Failing(Counter):
-    def reset(self, *, seed=None, options=None):
-        return len(seed)
-
-
 def test_environment_without_seed_is_rejected():
-    env = make_env(GymnasiumTask(Seedless))
+    seedless = type("Seedless", (Counter,), {"reset": lambda self: Counter.reset(self)})
     with pytest.raises(UserError, match=r"Seedless cannot be reset with a seed \(.* 'seed'\): give it Gymnasium's"):
-        env.reset(0)
+        make_env(GymnasiumTask(seedless)).reset(0)
+    failing = type("Failing", (Counter,), {"reset": lambda self, seed: len(seed)})
     with pytest.raises(TypeError, match="has no len"):  # the environment's own defects are not converted
-        make_env(GymnasiumTask(Failing)).reset(0)
+        make_env(GymnasiumTask(failing)).reset(0)
 
 
 @pytest.mark.parametrize(
