@@ -75,7 +75,7 @@ def write_fake_set(
     names: Sequence[str] | None = None,
     attributes: dict[str, Any] | None = None,
 ) -> Path:
-    """Write a set of episodes with `lengths` rows and return its folder.
+    """Write a set of episodes with `lengths` rows, in shards from `cuts` on, and return its folder.
 
     Args:
         folder: made if missing; name it `.../walker_walk/expert` to give the set a task and quality.
@@ -85,9 +85,17 @@ def write_fake_set(
     rows = fake_rows(lengths, action_dim, complete_last, physics_dim)
     edges = [0, *cuts, len(rows["reward"])]
     names = names or [f"{i}_fake.hdf5" for i in range(len(edges) - 1)]
-    folder.mkdir(parents=True, exist_ok=True)
     for name, start, end in zip(names, edges[:-1], edges[1:], strict=True):
-        write_shard(folder / name, {k: v[start:end] for k, v in rows.items()}, attributes or {})
+        write_rows(folder, {k: v[start:end] for k, v in rows.items()}, attributes, name)
+    return folder
+
+
+def write_rows(
+    folder: Path, rows: dict[str, np.ndarray], attributes: dict[str, Any] | None = None, name: str = "0_fake.hdf5"
+) -> Path:
+    """Write a set of one shard, or a further shard, and return its folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_shard(folder / name, rows, attributes or {})
     return folder
 
 

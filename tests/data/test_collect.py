@@ -138,16 +138,6 @@ def test_medium_replay_uses_training_snapshots_in_order(tmp_path, monkeypatch):
     assert "Regenerated from snapshots of the training run" in (tmp_path / "card.md").read_text()
 
 
-@pytest.mark.parametrize("quality", ["medium_replay", "medium_expert"])
-def test_quality_without_shipped_actor_is_rejected(tmp_path, monkeypatch, quality):
-    from vd4rl_pomdp.policies import actor as actors
-
-    monkeypatch.setattr(actors, "ASSETS", tmp_path / "none")
-    with pytest.raises(UserError, match=r"actor ships for humanoid_walk .*train_actor.py humanoid_walk"):
-        collect(config(tmp_path / "set", task="humanoid_walk", quality=quality), LENGTH)
-    assert not (tmp_path / "set").exists()
-
-
 def test_provenance_is_separate_from_config(whole):
     provenance = json.loads((whole / "provenance.json").read_text())
     assert provenance["frames"] == 3 * (LENGTH + 1)
@@ -181,9 +171,13 @@ def test_collecting_into_foreign_folder_is_rejected(tmp_path):
         ({"episodes": 1, "quality": "medium_expert"}, "at least 2 for medium_expert"),
         ({"actor": Path("a.safetensors"), "quality": "medium_expert"}, "--actor is for medium or expert"),
         ({"actor": Path("a.safetensors"), "quality": "expert"}, "a.safetensors"),
+        ({"quality": "expert_noisy", "action_noise": 0.1}, "expert_noisy has its own noise"),
+        ({"task": "humanoid_walk", "quality": "medium_replay"}, "actor ships for humanoid_walk .*train_actor.py huma"),
+        ({"task": "humanoid_walk", "quality": "medium_expert"}, "actor ships for humanoid_walk .*train_actor.py huma"),
     ],
 )
-def test_invalid_collect_settings_write_nothing(tmp_path, change, message):
+def test_invalid_collect_settings_write_nothing(tmp_path, monkeypatch, change, message):
+    monkeypatch.setattr("vd4rl_pomdp.policies.actor.ASSETS", tmp_path / "none")  # no actor ships
     with pytest.raises(UserError, match=message):
         collect(config(tmp_path / "set", **change), LENGTH)
     assert not (tmp_path / "set").exists()
@@ -221,12 +215,6 @@ def test_action_noise_has_requested_standard_deviation(tmp_path):
     noise = module._roll_out(replace(job, actor=still, size=None))["action"][1:]
     assert noise[np.abs(noise) < 1].std() == pytest.approx(0.4371, abs=0.03)  # a Gaussian of 0.5, cut at +-1
     assert noise.mean() == pytest.approx(0.0, abs=0.05)
-
-
-def test_noisy_quality_rejects_action_noise_option(tmp_path):
-    with pytest.raises(UserError, match="expert_noisy has its own noise"):
-        collect(config(tmp_path / "set", quality="expert_noisy", action_noise=0.1), LENGTH)
-    assert not (tmp_path / "set").exists()
 
 
 def test_unrendered_episodes_equal_rendered_ones(tmp_path):

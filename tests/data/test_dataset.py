@@ -3,13 +3,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set
+from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set, write_rows
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
-from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.data import TransitionSampler, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.folder import shard_paths
-from vd4rl_pomdp.data.format import write_shard
 
 LENGTHS = (5, 3, 260)
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
@@ -78,29 +76,22 @@ def test_n_step_returns_stop_at_episode_end(dataset, n):
 
 
 def test_stored_discounts_multiply_n_step_returns(tmp_path):
-    rows = fake_rows((5,))
-    rows["discount"] = np.array([9.0, 0.5, 0.25, 1.0, 0.0])
-    (tmp_path / "set").mkdir()
-    write_shard(tmp_path / "set" / "0_a.hdf5", rows, {})
-    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
-    np.testing.assert_allclose(View(dataset).transitions(range(4)).discount, [0.5, 0.25, 1.0, 0.0])
-    batch = View(dataset).transitions(range(4), n_step=2, gamma=0.1)
+    rows = fake_rows((5,)) | {"discount": np.array([9.0, 0.5, 0.25, 1.0, 0.0])}
+    view = View(open_dataset(write_rows(tmp_path / "set", rows), tmp_path / "cache"))
+    np.testing.assert_allclose(view.transitions(range(4)).discount, [0.5, 0.25, 1.0, 0.0])
+    batch = view.transitions(range(4), n_step=2, gamma=0.1)
     np.testing.assert_allclose(batch.discount, [0.0125, 0.025, 0.0, 0.0])
     np.testing.assert_allclose(batch.reward, [0.00005, 0.00105, 0.0023, 0.003], rtol=1e-5)
 
 
 def test_reward_of_first_row_is_ignored(tmp_path):
-    returns, rewards = [], []
-    for name, stored in (("plain", 0.0), ("odd", 100.0)):
+    found = []
+    for stored in (0.0, 100.0):
         rows = fake_rows((5, 3))
         rows["reward"][[0, 5]] = stored
-        (tmp_path / name).mkdir()
-        write_shard(tmp_path / name / "0_a.hdf5", rows, {})
-        dataset = open_dataset(tmp_path / name, tmp_path / "cache")
-        returns.append(dataset.returns.tolist())
-        rewards.append(View(dataset).transitions(range(6), n_step=3).reward.tolist())
-    assert returns[0] == returns[1]
-    assert rewards[0] == rewards[1]
+        dataset = open_dataset(write_rows(tmp_path / str(stored), rows), tmp_path / "cache")
+        found.append((dataset.returns.tolist(), View(dataset).transitions(range(6), n_step=3).reward.tolist()))
+    assert found[0] == found[1]
 
 
 def test_last_row_has_zero_return(dataset):
@@ -139,12 +130,10 @@ def test_window_fields_are_aligned(dataset):
 
 
 def test_window_longer_than_an_episode_is_rejected(dataset):
-    for call in (lambda: dataset.num_windows(6), lambda: View(dataset).windows([0], 6)):
-        with pytest.raises(
-            UserError,
-            match=r"episode 0 has 5 rows, fewer than the window of 6 \(2 such episodes\); choose a window of at most 3",
-        ):
-            call()
+    message = r"episode 0 has 5 rows, fewer than the window of 6 \(2 such episodes\); choose a window of at most 3"
+    for call in (dataset.num_windows, lambda length: View(dataset).windows([0], length)):
+        with pytest.raises(UserError, match=message):
+            call(6)
 
 
 def test_windows_skip_episodes_of_one_row(tmp_path):
@@ -191,47 +180,49 @@ def test_gathered_frames_are_copies(dataset):
     assert dataset.frames[0].max() == 0
 
 
-def test_shard_attributes_take_precedence_over_folder_names(tmp_path):
-    folder = tmp_path / "cheetah_run" / "random"
-    write_fake_set(folder, attributes={"task": "walker_walk", "set": "medium"})
-    dataset = open_dataset(folder, tmp_path / "cache")
-    assert (dataset.task, dataset.quality) == ("walker_walk", "medium")
-    plain = open_dataset(write_fake_set(tmp_path / "elsewhere"), tmp_path / "cache")
-    assert (plain.task, plain.quality) == (None, None)
-    write_fake_set(folder, names=["1_fake.hdf5"], attributes={"task": "cheetah_run"})
+def test_names_come_from_attributes_then_folders(tmp_path):
+    def names(folder, **attributes):
+        dataset = open_dataset(write_fake_set(tmp_path / folder, attributes=attributes), tmp_path / "cache")
+        return dataset.task, dataset.quality
+
+    assert names("cheetah_run/random", task="walker_walk", set="medium") == ("walker_walk", "medium")
+    assert names("elsewhere") == (None, None)
+    assert names("expert/walker_walk/humanA") == ("walker_walk", "humanA"), "any folder below the task's"
+    folder = write_fake_set(tmp_path / "cheetah_run/random", names=["1_fake.hdf5"], attributes={"task": "cheetah_run"})
     with pytest.raises(UserError, match="its shards come from cheetah_run and walker_walk"):
         open_dataset(folder, tmp_path / "cache")
 
 
-def test_samplers_are_seeded_and_cover_all_rows(dataset):
-    def draws(sampler, count):
-        return [next(batches).key.tolist() for batches in [iter(sampler)] for _ in range(count)]
+SAMPLERS = {
+    "transitions": lambda view, draws: TransitionSampler(view, 64, draws, n_step=2),
+    "windows": lambda view, draws: WindowSampler(view, 64, 2, draws),
+}
 
-    def transitions(seed):
-        return TransitionSampler(View(dataset, frame_stack=1), 64, torch.Generator().manual_seed(seed), n_step=2)
 
-    def windows(seed):
-        return WindowSampler(View(dataset, frame_stack=1), 64, 2, torch.Generator().manual_seed(seed))
+@pytest.mark.parametrize("kind", SAMPLERS)
+def test_samplers_are_seeded_and_cover_all_rows(dataset, kind):
+    def keys(seed):
+        sampler = iter(SAMPLERS[kind](View(dataset, frame_stack=1), torch.Generator().manual_seed(seed)))
+        return torch.cat([next(sampler).key for _ in range(30)])
 
-    for make in (transitions, windows):
-        first = draws(make(0), 30)
-        assert first == draws(make(0), 30)
-        assert first != draws(make(1), 30)
-        keys = {tuple(np.atleast_1d(key)) for batch in first for key in batch}
-        assert {key[0] for key in keys} == {(e << 20) + t for e, t in STARTS}
+    assert torch.equal(keys(0), keys(0))
+    assert not torch.equal(keys(0), keys(1))
+    assert set(keys(0).view(30 * 64, -1)[:, 0].tolist()) == {(e << 20) + t for e, t in STARTS}
 
 
 @pytest.mark.gpu
-def test_cuda_batches_equal_cpu_batches(tmp_path):
+@pytest.mark.parametrize("kind", SAMPLERS)
+def test_cuda_batches_equal_cpu_batches(tmp_path, kind):
     folder = write_fake_set(tmp_path / "set", (9, 5))
-    for make in (
-        lambda d: TransitionSampler(d, 32, RandomStream(torch.Generator().manual_seed(0)), n_step=3),
-        lambda d: WindowSampler(d, 8, 4, RandomStream(torch.Generator().manual_seed(0))),
-    ):
-        here, there = (make(open_dataset(folder, tmp_path / "cache").to(device)).sample() for device in ("cpu", "cuda"))
-        assert there.obs.is_cuda
-        for name in here.keys():  # noqa: SIM118
-            torch.testing.assert_close(there[name].cpu(), here[name])
+    here, there = (
+        SAMPLERS[kind](
+            View(open_dataset(folder, tmp_path / "cache").to(device)), torch.Generator().manual_seed(0)
+        ).sample()
+        for device in ("cpu", "cuda")
+    )
+    assert there.obs.is_cuda
+    for name in here.keys():  # noqa: SIM118
+        torch.testing.assert_close(there[name].cpu(), here[name])
 
 
 def test_quirks_of_published_files_are_read_correctly(tmp_path):
@@ -254,11 +245,6 @@ def test_quirks_of_published_files_are_read_correctly(tmp_path):
     starts = [(e, t) for e, t in expected if t + 1 < lengths[e]]
     batch = View(dataset).transitions(range(dataset.num_transitions))
     np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t, 21) for e, t in starts]))
-
-
-def test_quality_is_the_folder_below_the_task(tmp_path):
-    folder = write_fake_set(tmp_path / "expert" / "walker_walk" / "humanA")
-    assert open_dataset(folder, tmp_path / "cache").quality == "humanA"
 
 
 def test_symlink_names_determine_task_and_quality(tmp_path):

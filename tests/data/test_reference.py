@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers_data import fake_rows, write_fake_set
+from tests.helpers_data import fake_rows, write_fake_set, write_rows
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.reference import Reference, summarise
 from vd4rl_pomdp.policies import load_actor
 from vd4rl_pomdp.policies.actor import ASSETS
@@ -37,9 +36,8 @@ ACTOR = {"task": "walker_walk", "quality": "expert", "sha256": EXPERT}
     ids=["expert", "noisy", "medium", "two", "partly", "own", "other task", "random", "published", "no task"],
 )
 def test_reference_actor_is_known_only_if_single_and_shipped(tmp_path, shards, known):
-    (tmp_path / "set").mkdir()
     for number, attributes in enumerate(shards):
-        write_shard(tmp_path / "set" / f"{number}_fake.hdf5", fake_rows([8, 8]), attributes)
+        write_rows(tmp_path / "set", fake_rows([8, 8]), attributes, f"{number}_fake.hdf5")
     dataset = open_dataset(tmp_path / "set")
     reference = Reference.of(dataset)
     assert reference.actor == (None if known is None else ACTOR | known)
@@ -77,12 +75,9 @@ def test_damaged_reference_is_rejected(tmp_path, change):
 
 
 def test_summary_counts_episodes_above_80_percent_of_data_return():
-    rows = [
-        {"return": total, "score": total / 10, "action_error": error}
-        for total, error in ((90.0, 0.2), (80.0, 0.4), (100.0, None))
-    ]
-    summary = summarise(rows, Reference(data_return=100.0))
-    assert summary == {
+    given = (90.0, 0.2), (80.0, 0.4), (100.0, None)
+    rows = [{"return": total, "score": total / 10, "action_error": error} for total, error in given]
+    assert summarise(rows, Reference(data_return=100.0)) == {
         "score_mean": 9.0,
         "score_min": 8.0,
         "score_max": 10.0,
@@ -90,6 +85,6 @@ def test_summary_counts_episodes_above_80_percent_of_data_return():
         "share_above_80": 2 / 3,
         "action_error": pytest.approx(0.3),
     }
-    assert summarise(rows[2:], Reference())["share_above_80"] is None
-    assert summarise(rows[2:], Reference(data_return=-5.0))["share_above_80"] is None, "undefined for a negative return"
-    assert summarise(rows[2:], Reference())["action_error"] is None
+    for unknown in (None, -5.0):  # undefined for a negative return
+        last = summarise(rows[2:], Reference(data_return=unknown))
+        assert (last["share_above_80"], last["action_error"]) == (None, None)
