@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.helpers_data import assert_equal_rows, fake_episode, fake_reward, rows_of_set, write_fake_set
+from tests.helpers_data import assert_equal_rows, fake_episode, fake_reward, rows_of_set, write_fake_set, write_rows
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.format import FRAMES_KEY, write_shard
+from vd4rl_pomdp.data.format import FRAMES_KEY
 from vd4rl_pomdp.data.formats.lerobot import LEROBOT, _encode
 from vd4rl_pomdp.data.transfer import export_set, import_set
 
@@ -30,10 +30,9 @@ def exported(tmp_path):
     rng, episodes = np.random.default_rng(0), [fake_episode(number, length) for number, length in enumerate(LENGTHS)]
     rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
     rows[FRAMES_KEY] = rng.integers(0, 256, rows[FRAMES_KEY].shape, np.uint8)
-    (tmp_path / "own").mkdir()
-    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk", "set": "mine"})
-    export_set("lerobot", tmp_path / "own", tmp_path / "out")
-    return tmp_path / "out", tmp_path / "own"
+    own = write_rows(tmp_path / "own", rows, {"task": "walker_walk", "set": "mine"})
+    export_set("lerobot", own, tmp_path / "out")
+    return tmp_path / "out", own
 
 
 def rewrite(folder, change, name=DATA):
@@ -104,11 +103,10 @@ def test_exported_rows_follow_lerobot_format(exported):
 
 
 def test_lerobot_video_changes_only_images(tmp_path, capsys):
-    own, rows = tmp_path / "own", fake_episode(0, 25)
+    rows = fake_episode(0, 25)
     grey = np.arange(25, dtype=np.uint8) * 10
     rows[FRAMES_KEY] = np.broadcast_to(grey[:, None, None, None], (25, 3, 84, 84))
-    own.mkdir()
-    write_shard(own / "0_a.hdf5", rows, {"task": "walker_walk", "set": "mine"})
+    own = write_rows(tmp_path / "own", rows, {"task": "walker_walk", "set": "mine"})
     export_set("lerobot_video", own, tmp_path / "out")
     assert "values are off by" in capsys.readouterr().err
     import_set("lerobot", str(tmp_path / "out"), tmp_path / "back")
@@ -168,32 +166,28 @@ def test_lerobot_camera_is_selected_by_picture_option(exported, tmp_path):
     np.testing.assert_array_equal(rows_of_set(tmp_path / "back")[FRAMES_KEY], frames[::-1])
 
 
+def info(change):
+    """Damage by a change to info.json."""
+    return lambda folder: edit_info(folder, change)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda out: (out / "meta" / "info.json").unlink(), "not a local LeRobot dataset"),
-        (lambda out: edit_info(out, lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
-        (lambda out: edit_info(out, lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
-        (lambda out: edit_info(out, lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
-        (
-            lambda out: edit_info(out, lambda info: info.pop("features")),
-            r"info.json: its features is missing or damaged",
-        ),
-        (lambda out: edit_info(out, lambda info: info.update(fps="20")), r"info.json: its fps is missing or damaged"),
-        (
-            lambda out: edit_info(out, lambda info: info["features"].update(action=[])),
-            "its action is missing or damaged",
-        ),
-        (
-            lambda out: edit_info(out, lambda i: i["features"][PICTURE].update(shape=[64, 64, 3])),
-            "84x84 pixels, .* 64x64",
-        ),
-        (lambda out: edit_info(out, lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
         (lambda out: (out / DATA).unlink(), "No such file"),
         (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
         (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "lacks rows"),
         (lambda out: rewrite(out, deepen), "more than 8 bits per channel .*: convert it to 8 bits"),
-        (lambda out: edit_info(out, lambda info: info["features"].pop("observation.image")), "holds no images"),
+        (info(lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
+        (info(lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
+        (info(lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
+        (info(lambda info: info.pop("features")), r"info.json: its features is missing or damaged"),
+        (info(lambda info: info.update(fps="20")), r"info.json: its fps is missing or damaged"),
+        (info(lambda info: info["features"].update(action=[])), "its action is missing or damaged"),
+        (info(lambda info: info["features"][PICTURE].update(shape=[64, 64, 3])), "84x84 pixels, .* 64x64"),
+        (info(lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
+        (info(lambda info: info["features"].pop(PICTURE)), "holds no images"),
     ],
 )
 def test_damaged_lerobot_sets_are_rejected(exported, damage, message, tmp_path):
