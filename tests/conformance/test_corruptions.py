@@ -9,21 +9,11 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.corruptions import CORRUPTIONS, STAGES, Corruption, FrameDrop, Patch
 from vd4rl_pomdp.testing import check_corruption
+from vd4rl_pomdp.testing import corruptions as checks
 from vd4rl_pomdp.testing.contract import run_check
-from vd4rl_pomdp.testing.corruptions import (
-    CHECKS,
-    a_view_shows_shifted_then_corrupted_stacks,
-    draws_depend_on_keys_alone,
-    emission_never_changes_a_row,
-    equal_keys_give_equal_masks,
-    frames_that_are_dropped_stay_dropped,
-    pixels_stay_pixels,
-    something_changes,
-    the_environment_shows_what_the_data_show,
-)
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", checks.CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", dict.fromkeys([*CORRUPTIONS, *STAGES]))
 def test_corruption_conforms(name, check):
     run_check("corruption", check, name)
@@ -61,8 +51,8 @@ class Alternating(FrameDrop):
         return torch.arange(stack) * torch.where(key % 2 == 0, -1, 1)[:, None]
 
 
-def test_user_defined_frame_drop_conforms(stages):
-    stages.register("mine", Alternating)
+def test_user_defined_frame_drop_conforms():
+    STAGES.register("mine", Alternating)
     for name in ("mine", "patch+mine"):
         check_corruption(name)
     with pytest.raises(UserError, match="zero_frames or truncate or mine only at the end"):
@@ -133,32 +123,26 @@ class Wavering(Alternating):
 
 
 MUTANTS = [
-    (Nothing, something_changes, "none differs"),
-    (Batchwise, equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
-    (Batchwise, the_environment_shows_what_the_data_show, "a row looks different in the environment"),
-    (Drawing, draws_depend_on_keys_alone, "equal keys gave different pixels"),
-    (Counting, emission_never_changes_a_row, "a row looked different the second time"),
-    (Counting, a_view_shows_shifted_then_corrupted_stacks, "they differ under resample with a shift of 0"),
-    (Elsewhere, a_view_shows_shifted_then_corrupted_stacks, "a GPU would hide other pixels"),
-    (Wavering, frames_that_are_dropped_stay_dropped, "a dropped frame is not black"),
-    (Failing, pixels_stay_pixels, "IndexError: no such column"),
+    (Nothing, checks.something_changes, "none differs"),
+    (Batchwise, checks.equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
+    (Batchwise, checks.the_environment_shows_what_the_data_show, "a row looks different in the environment"),
+    (Drawing, checks.draws_depend_only_on_keys, "equal keys gave different pixels"),
+    (Counting, checks.emission_never_changes_a_row, "a row looked different the second time"),
+    (Counting, checks.a_view_shows_shifted_then_corrupted_stacks, "they differ under resample with a shift of 0"),
+    (Elsewhere, checks.a_view_shows_shifted_then_corrupted_stacks, "a GPU would hide other pixels"),
+    (Wavering, checks.dropped_frames_stay_dropped, "a dropped frame is not black"),
+    (Failing, checks.pixels_stay_pixels, "IndexError: no such column"),
 ]
 
 
-@pytest.fixture
-def stages():
-    with STAGES.isolated():
-        yield STAGES
-
-
-def test_overridden_call_of_a_subclass_is_used(stages):
-    stages.register("mine", Inheriting)
-    run_check("corruption", a_view_shows_shifted_then_corrupted_stacks, "mine")
+def test_overridden_call_of_a_subclass_is_used():
+    STAGES.register("mine", Inheriting)
+    run_check("corruption", checks.a_view_shows_shifted_then_corrupted_stacks, "mine")
 
 
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_nonconforming_corruptions_are_caught(stages, kind, check, reason):
-    stages.register("mine", kind)
+def test_nonconforming_corruptions_are_caught(kind, check, reason):
+    STAGES.register("mine", kind)
     with pytest.raises(AssertionError, match=f"corruption 'mine' violates its contract(.|\n)*{reason}"):
         run_check("corruption", check, "mine")
 
@@ -166,11 +150,11 @@ def test_nonconforming_corruptions_are_caught(stages, kind, check, reason):
 def test_modified_input_is_caught(monkeypatch):
     monkeypatch.setattr(Corruption, "__call__", Corruption.apply_)
     with pytest.raises(AssertionError, match="the input was changed"):
-        run_check("corruption", pixels_stay_pixels, "patch")
+        run_check("corruption", checks.pixels_stay_pixels, "patch")
 
 
-def test_check_corruption_accepts_options(stages):
-    stages.register("larger", type("Larger", (Patch,), {}))
+def test_check_corruption_accepts_options():
+    STAGES.register("larger", type("Larger", (Patch,), {}))
     check_corruption("larger", patch_size=20)
     with pytest.raises(UserError, match="--zeroed-frames is not read by the corruption patch"):
         check_corruption("patch", zeroed_frames=1)

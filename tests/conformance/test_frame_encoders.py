@@ -9,22 +9,14 @@ from torch import nn
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoderPart
 from vd4rl_pomdp.testing import check_frame_encoder
+from vd4rl_pomdp.testing import frame_encoders as checks
 from vd4rl_pomdp.testing.contract import run_check
-from vd4rl_pomdp.testing.frame_encoders import (
-    CHECKS,
-    a_folder_gives_back_the_encoder,
-    a_seed_decides_everything,
-    features_have_one_shape,
-    gradients_reach_all_parameters,
-    make,
-    pictures_are_not_mixed,
-)
 
 SIZE = 20
 """Image size that all encoders with small kernels can read."""
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", checks.CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize(
     "name", [name for name in FRAME_ENCODERS if name != "pretrained"]
 )  # tests/nn/test_pretrained.py
@@ -82,34 +74,36 @@ class Backbone(nn.Conv2d):
 
 
 MUTANTS = [
-    (Bounded, features_have_one_shape, "some are not finite"),
-    (lambda: nn.BatchNorm2d(4), pictures_are_not_mixed, r"features of image 1 have gradients to \[True, True, True\]"),
-    (Lost, gradients_reach_all_parameters, "none reaches convolutions.1.unused.bias, convolutions.1.unused.weight"),
-    (nn.Dropout, a_seed_decides_everything, "features differ between calls, training True"),
-    (Hidden, a_folder_gives_back_the_encoder, "its features differ"),
+    (Bounded, checks.features_have_one_shape, "some are not finite"),
+    (
+        lambda: nn.BatchNorm2d(4),
+        checks.images_are_not_mixed,
+        r"features of image 1 have gradients to \[True, True, True\]",
+    ),
+    (
+        Lost,
+        checks.gradients_reach_all_parameters,
+        "none reaches convolutions.1.unused.bias, convolutions.1.unused.weight",
+    ),
+    (nn.Dropout, checks.a_seed_decides_everything, "features differ between calls, training True"),
+    (Hidden, checks.a_folder_gives_back_the_encoder, "its features differ"),
 ]
 
 
-@pytest.fixture
-def encoders():
-    with FRAME_ENCODERS.isolated():
-        yield FRAME_ENCODERS
-
-
 @pytest.mark.parametrize(("layer", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_nonconforming_frame_encoders_are_caught(encoders, layer, check, reason):
-    encoders.register("mine", FrameEncoderPart(with_layer(layer)))
+def test_nonconforming_frame_encoders_are_caught(layer, check, reason):
+    FRAME_ENCODERS.register("mine", FrameEncoderPart(with_layer(layer)))
     with pytest.raises(AssertionError, match=f"frame encoder 'mine' violates its contract(.|\n)*{reason}"):
         run_check("frame encoder", check, "mine", size=SIZE)
 
 
-def test_frozen_backbone_conforms(encoders):
-    encoders.register("mine", FrameEncoderPart(with_layer(Backbone)))
+def test_frozen_backbone_conforms():
+    FRAME_ENCODERS.register("mine", FrameEncoderPart(with_layer(Backbone)))
     check_frame_encoder("mine", size=SIZE)
 
 
-def test_check_frame_encoder_accepts_conforming_encoders(encoders):
-    encoders.register("mine", FrameEncoderPart(convolution))
+def test_check_frame_encoder_accepts_conforming_encoders():
+    FRAME_ENCODERS.register("mine", FrameEncoderPart(convolution))
     check_frame_encoder("mine")
     check_frame_encoder("mine", size=SIZE, feature_dim=5)
     with pytest.raises(UserError, match="--depth is not read by"):
@@ -143,8 +137,8 @@ class OverFrames(nn.Module):
 
 
 @pytest.mark.parametrize("layer", [Twice, OverFrames])
-def test_shared_weights_and_3d_convolutions_conform(encoders, layer):
-    encoders.register("mine", FrameEncoderPart(with_layer(layer)))
+def test_shared_weights_and_3d_convolutions_conform(layer):
+    FRAME_ENCODERS.register("mine", FrameEncoderPart(with_layer(layer)))
     check_frame_encoder("mine", size=SIZE)
 
 
@@ -161,12 +155,12 @@ class Pair(nn.Module):
         (lambda channels, size, options: Pair(), r"'mine' makes a tuple of N images, not maps \(N, C', H', W'\)"),
     ],
 )
-def test_invalid_frame_encoders_are_rejected(encoders, build, message):
-    encoders.register("mine", FrameEncoderPart(build))
+def test_invalid_frame_encoders_are_rejected(build, message):
+    FRAME_ENCODERS.register("mine", FrameEncoderPart(build))
     with pytest.raises(UserError, match=message):
-        make("mine", size=SIZE)
+        checks.make("mine", size=SIZE)
 
 
-def test_reserved_frame_encoder_name_is_rejected(encoders):
+def test_reserved_frame_encoder_name_is_rejected():
     with pytest.raises(UserError, match="frame encoder 'state': this name is reserved"):
-        encoders.register("state", FrameEncoderPart(convolution))
+        FRAME_ENCODERS.register("state", FrameEncoderPart(convolution))

@@ -10,19 +10,11 @@ from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.memory import GRU, MEMORIES, GRUOptions, MemoryPart
 from vd4rl_pomdp.testing import check_memory, check_method
+from vd4rl_pomdp.testing import memories as checks
 from vd4rl_pomdp.testing.contract import run_check
-from vd4rl_pomdp.testing.memories import (
-    CHECKS,
-    a_folder_gives_back_the_encoder,
-    a_state_depends_on_its_past_alone,
-    gradients_reach_all_parameters,
-    observations_are_read_where_it_says,
-    outputs_have_one_shape,
-    streaming_equals_batch,
-)
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", checks.CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -39,12 +31,6 @@ from vd4rl_pomdp.testing.memories import (
 )
 def test_memory_conforms(check, name, options):
     run_check("memory", check, name, **options)
-
-
-@pytest.fixture
-def memories():
-    with MEMORIES.isolated():
-        yield MEMORIES
 
 
 def test_methods_conform_with_documented_memory(tmp_path, monkeypatch):
@@ -114,33 +100,33 @@ class Hidden(GRU):
     [
         (
             Averaged,
-            a_state_depends_on_its_past_alone,
+            checks.a_state_depends_only_on_its_past,
             r"row 0 of window 1 has gradients to \(window, row\) \[\(1, 0\), ",
         ),
-        (Short, a_state_depends_on_its_past_alone, "only rows 1 to 2 of window 1 may have one"),
-        (Forgetful, streaming_equals_batch, "they differ for"),
-        (Peeking, observations_are_read_where_it_says, "o_1 moves rows"),
-        (Wide, outputs_have_one_shape, r"\(3, 6, 14\)"),
-        (Unused, gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
-        (Hidden, a_folder_gives_back_the_encoder, "its states differ"),
+        (Short, checks.a_state_depends_only_on_its_past, "only rows 1 to 2 of window 1 may have one"),
+        (Forgetful, checks.streaming_equals_batch, "they differ for"),
+        (Peeking, checks.observations_are_read_where_it_says, "o_1 moves rows"),
+        (Wide, checks.outputs_have_one_shape, r"\(3, 6, 14\)"),
+        (Unused, checks.gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
+        (Hidden, checks.a_folder_gives_back_the_encoder, "its states differ"),
     ],
 )
-def test_nonconforming_memories_are_caught(memories, kind, check, reason):
-    memories.register("mine", MemoryPart(kind, GRUOptions))
+def test_nonconforming_memories_are_caught(kind, check, reason):
+    MEMORIES.register("mine", MemoryPart(kind, GRUOptions))
     with pytest.raises(AssertionError, match=f"memory 'mine' violates its contract(.|\n)*{reason}"):
         run_check("memory", check, "mine")
 
 
 @pytest.mark.parametrize("name", ["none", "method"])
-def test_reserved_memory_names_are_rejected(memories, name):
+def test_reserved_memory_names_are_rejected(name):
     with pytest.raises(UserError, match=f"memory '{name}': this name is reserved"):
-        memories.register(name, MemoryPart(GRU, GRUOptions))
+        MEMORIES.register(name, MemoryPart(GRU, GRUOptions))
 
 
-def test_invalid_memories_are_rejected(memories):
-    memories.register("mine", MemoryPart(lambda inputs, options: torch.nn.Identity()))
+def test_invalid_memories_are_rejected():
+    MEMORIES.register("mine", MemoryPart(lambda inputs, options: torch.nn.Identity()))
     with pytest.raises(UserError, match=r"memory .mine. builds a Identity, not a vd4rl"):
         check_memory("mine")
-    memories.register("frame", MemoryPart(GRU, GRUOptions))
+    MEMORIES.register("frame", MemoryPart(GRU, GRUOptions))
     with pytest.raises(UserError, match="memory 'frame': an encoder has an attribute of this name"):
         check_memory("frame")

@@ -10,22 +10,10 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.objective import InverseOptions, Objective, StateInverse
 from vd4rl_pomdp.testing import check_method
+from vd4rl_pomdp.testing import methods as checks
 from vd4rl_pomdp.testing.contract import run_check
-from vd4rl_pomdp.testing.methods import (
-    ROWS,
-    a_loss_is_a_finite_scalar,
-    a_loss_moves_the_whole_encoder,
-    a_training_that_goes_on_elsewhere_takes_the_same_steps,
-    batch,
-    build,
-    checks_of,
-    padding_changes_no_loss,
-    predictions_depend_on_what_is_declared,
-    steps_lower_the_loss,
-    streaming_equals_batch,
-)
 
-CASES = [(name, check) for name in METHODS for check in checks_of(name)]
+CASES = [(name, check) for name in METHODS for check in checks.checks_of(name)]
 
 
 @pytest.mark.parametrize(("name", "check"), CASES, ids=lambda value: getattr(value, "__name__", value))
@@ -35,20 +23,20 @@ def test_method_conforms(name: str, check: Callable):
 
 def test_inverse_loss_is_the_action_loss():
     """`check_method` tests the weighted terms."""
-    loss, logs = build("mik+a").loss(batch(), 0.0)
+    loss, logs = checks.build("mik+a").loss(checks.batch(), 0.0)
     assert torch.equal(loss.detach(), logs["action_loss"])
 
 
 def test_self_prediction_has_no_gradient_to_its_target():
     """||sg(s_{t+k}) - g(s_t, k)||^2: a window's last state is only a target and must receive no gradient."""
-    objective, window = build("mik+a", self_prediction=1.0), batch((ROWS, ROWS))
+    objective, window = checks.build("mik+a", self_prediction=1.0), checks.batch((checks.ROWS, checks.ROWS))
     past, future = (x.detach().requires_grad_() for x in objective.representations(window))
     loss, logs = objective.loss_of(past, future, window, 0.0)
     loss.backward()
-    assert (past.grad.abs().amax((0, 2)) > 0).tolist() == [True] * (ROWS - 1) + [False]
+    assert (past.grad.abs().amax((0, 2)) > 0).tolist() == [True] * (checks.ROWS - 1) + [False]
 
     errors = []
-    for t, k in objective.pairs(ROWS).tolist():
+    for t, k in objective.pairs(checks.ROWS).tolist():
         asked = torch.cat([past[:, t], torch.full((2, 1), k / objective.options.max_k)], dim=-1)
         errors.append((objective.predictor(asked) - past[:, t + k]).square().mean())
     torch.testing.assert_close(logs["self_prediction"], torch.stack(errors).mean().detach())
@@ -151,40 +139,38 @@ class Undeclared(StateInverse):
 
 
 MUTANTS = [
-    (Diverged, a_loss_is_a_finite_scalar, "it is inf"),
-    (Attached, a_loss_is_a_finite_scalar, "loss is logged with its graph"),
-    (Misreported, a_loss_is_a_finite_scalar, "is logged, the loss is"),
-    (Frozen, a_loss_moves_the_whole_encoder, "none reaches frame.project.0.bias"),
-    (Still, steps_lower_the_loss, "the mean of the first five is"),
-    (Counting, a_training_that_goes_on_elsewhere_takes_the_same_steps, "keep what the loss reads as parameters"),
-    (Drawing, a_training_that_goes_on_elsewhere_takes_the_same_steps, "draw from nn.draws.Draws"),
-    (Unmasked, padding_changes_no_loss, "leave out rows beyond `real`"),
-    (Looking, streaming_equals_batch, "the two differ"),
-    (Undeclared, predictions_depend_on_what_is_declared, "the prediction of a_0 from rows 0 and 1 has gradients to"),
+    (Diverged, checks.a_loss_is_a_finite_scalar, "it is inf"),
+    (Attached, checks.a_loss_is_a_finite_scalar, "loss is logged with its graph"),
+    (Misreported, checks.a_loss_is_a_finite_scalar, "is logged, the loss is"),
+    (Frozen, checks.a_loss_moves_the_whole_encoder, "none reaches frame.project.0.bias"),
+    (Still, checks.steps_lower_the_loss, "the mean of the first five is"),
+    (Counting, checks.a_resumed_training_takes_the_same_steps, "keep what the loss reads as parameters"),
+    (Drawing, checks.a_resumed_training_takes_the_same_steps, "draw from nn.draws.Draws"),
+    (Unmasked, checks.padding_changes_no_loss, "leave out rows beyond `real`"),
+    (Looking, checks.streaming_equals_batch, "the two differ"),
+    (
+        Undeclared,
+        checks.predictions_depend_on_what_is_declared,
+        "the prediction of a_0 from rows 0 and 1 has gradients to",
+    ),
 ]
 
 
-@pytest.fixture
-def methods():
-    with METHODS.isolated():
-        yield METHODS
-
-
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_nonconforming_methods_are_caught(methods, kind, check, reason):
+def test_nonconforming_methods_are_caught(kind, check, reason):
     options = {"options": InverseOptions} if issubclass(kind, StateInverse) else {}
-    methods.register("mine", Method(kind, **options))
+    METHODS.register("mine", Method(kind, **options))
     with pytest.raises(AssertionError, match=f"method 'mine' violates its contract(.|\n)*{reason}"):
         run_check("method", check, "mine")
 
 
-def test_check_method_accepts_conforming_methods(methods):
-    methods.register("mine", Method(Mean))
+def test_check_method_accepts_conforming_methods():
+    METHODS.register("mine", Method(Mean))
     check_method("mine")
     check_method("mine", feature_dim=5)
     with pytest.raises(UserError, match="--max-k is not read by the method mine"):
         check_method("mine", max_k=2)
-    methods.register("drawing", Method(DrawingInverse, options=InverseOptions))
+    METHODS.register("drawing", Method(DrawingInverse, options=InverseOptions))
     check_method("drawing")
     with pytest.raises(UserError, match="unknown method 'yours'"):
         check_method("yours")

@@ -14,20 +14,11 @@ from vd4rl_pomdp.envs import dmc
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.envs.gym import GymEnv
 from vd4rl_pomdp.testing import check_task
+from vd4rl_pomdp.testing import tasks as checks
 from vd4rl_pomdp.testing.contract import run_check
-from vd4rl_pomdp.testing.tasks import (
-    CHECKS,
-    actions_fill_their_bounds,
-    episodes_end_once,
-    episodes_repeat_from_their_seeds,
-    frames_have_the_size_asked_for,
-    frames_stay_as_they_were,
-    rewards_replay,
-    rows_have_the_declared_widths,
-)
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", checks.CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", TASKS)
 def test_task_conforms(name, check):
     run_check("task", check, name)
@@ -80,33 +71,31 @@ class Strict(Square):
         return super().step(action)
 
 
-@pytest.fixture
-def tasks():
-    with TASKS.isolated():
-        yield TASKS
-
-
 WALKER = TASKS["walker_walk"]
 MUTANTS = [
-    (GymnasiumTask(Unseeded), episodes_repeat_from_their_seeds, "row 0 differs in frame or state"),
-    (GymnasiumTask(Square, layout=Layout(3)), rows_have_the_declared_widths, "its layout says .* the environment has"),
-    (replace(WALKER, layout=Layout(6, 23, 9, travel=(1,))), rows_have_the_declared_widths, "its layout says"),
-    (GymnasiumTask(Failing), episodes_end_once, "RuntimeError: the motor is off"),
+    (GymnasiumTask(Unseeded), checks.episodes_repeat_from_their_seeds, "row 0 differs in frame or state"),
+    (
+        GymnasiumTask(Square, layout=Layout(3)),
+        checks.rows_have_the_declared_widths,
+        "its layout says .* the environment has",
+    ),
+    (replace(WALKER, layout=Layout(6, 23, 9, travel=(1,))), checks.rows_have_the_declared_widths, "its layout says"),
+    (GymnasiumTask(Failing), checks.episodes_end_once, "RuntimeError: the motor is off"),
 ]
 
 
 @pytest.mark.parametrize(("task", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
-def test_nonconforming_tasks_are_caught(tasks, task, check, reason):
-    tasks.register("mine", task)
+def test_nonconforming_tasks_are_caught(task, check, reason):
+    TASKS.register("mine", task)
     with pytest.raises(AssertionError, match=f"task 'mine' violates its contract(.|\n)*{reason}"):
         run_check("task", check, "mine")
 
 
-def test_harness_defects_are_caught(tasks, monkeypatch):
+def test_harness_defects_are_caught(monkeypatch):
     from vd4rl_pomdp.envs.gymnasium_task import GymnasiumEnv
     from vd4rl_pomdp.envs.pixels import PixelEnv
 
-    tasks.register("mine", GymnasiumTask(Square))
+    TASKS.register("mine", GymnasiumTask(Square))
     step, frame = PixelEnv.step, GymnasiumEnv._frame
     buffer = np.zeros((3, 84, 84), np.uint8)
 
@@ -115,25 +104,43 @@ def test_harness_defects_are_caught(tasks, monkeypatch):
         return buffer
 
     broken = [
-        (GymnasiumEnv, "_rescaled", lambda self, a: a * 5, actions_fill_their_bounds, "becomes .* the bounds are"),
+        (
+            GymnasiumEnv,
+            "_rescaled",
+            lambda self, a: a * 5,
+            checks.actions_fill_their_bounds,
+            "becomes .* the bounds are",
+        ),
         (
             GymnasiumEnv,
             "_rescaled",
             lambda self, a: a.astype(np.float64) * 2.5 + 0.5,
-            actions_fill_their_bounds,
+            checks.actions_fill_their_bounds,
             "are float64, its bounds float32",
         ),
-        (GymnasiumEnv, "_frame", lambda self, s: frame(self, s + 1), frames_have_the_size_asked_for, "of size 84 is"),
-        (GymnasiumEnv, "_frame", drawn_into_one_buffer, frames_stay_as_they_were, "row 0 changes in later rows"),
+        (
+            GymnasiumEnv,
+            "_frame",
+            lambda self, s: frame(self, s + 1),
+            checks.frames_have_the_size_asked_for,
+            "of size 84 is",
+        ),
+        (GymnasiumEnv, "_frame", drawn_into_one_buffer, checks.frames_stay_as_they_were, "row 0 changes in later rows"),
         (
             GymnasiumEnv,
             "_apply",
             lambda self, a: (np.inf, False, 1.0),
-            rows_have_the_declared_widths,
+            checks.rows_have_the_declared_widths,
             "a reward is inf",
         ),
-        (PixelEnv, "step", lambda self, a: replace(step(self, a), step_type=1), episodes_end_once, "does not end"),
-        (dmc, "replay_rewards", lambda n, p, a: np.zeros(len(a)), rewards_replay, "and replay as"),
+        (
+            PixelEnv,
+            "step",
+            lambda self, a: replace(step(self, a), step_type=1),
+            checks.episodes_end_once,
+            "does not end",
+        ),
+        (dmc, "replay_rewards", lambda n, p, a: np.zeros(len(a)), checks.rewards_replay, "and replay as"),
     ]
     for place, name, instead, check, reason in broken:
         with monkeypatch.context() as patch:
@@ -142,9 +149,9 @@ def test_harness_defects_are_caught(tasks, monkeypatch):
                 run_check("task", check, "walker_walk" if place is dmc else "mine")
 
 
-def test_check_task_accepts_conforming_tasks(tasks):
-    tasks.register("strict", GymnasiumTask(Strict, decisions=5))
-    tasks.register("reacher", DMCTask("reacher", "easy"))  # draws a random target, so it cannot be replayed
+def test_check_task_accepts_conforming_tasks():
+    TASKS.register("strict", GymnasiumTask(Strict, decisions=5))
+    TASKS.register("reacher", DMCTask("reacher", "easy"))  # draws a random target, so it cannot be replayed
     check_task("strict")
     check_task("reacher")
     with pytest.raises(UserError, match="unknown task 'mine'"):
@@ -152,14 +159,14 @@ def test_check_task_accepts_conforming_tasks(tasks):
 
 
 @pytest.mark.parametrize("task", ["lqr_2_1", "lqr_6_2"])
-def test_unbounded_dm_control_tasks_are_rejected(tasks, tmp_path, task):
-    tasks.register("unbounded", DMCTask("lqr", task))
+def test_unbounded_dm_control_tasks_are_rejected(tmp_path, task):
+    TASKS.register("unbounded", DMCTask("lqr", task))
     message = f"dm_control's lqr {task} has actions from -1e[+]10 to 1e[+]10: only bounds within -1e[+]09 and 1e[+]09"
     for play in (
         lambda: check_task("unbounded"),
         lambda: collect(CollectConfig("unbounded", "random", tmp_path / "set", episodes=1, workers=1)),
         lambda: GymEnv("unbounded"),
-        lambda: CorruptedEnv(tasks["unbounded"], CorruptionConfig.of("none")),
+        lambda: CorruptedEnv(TASKS["unbounded"], CorruptionConfig.of("none")),
         lambda: dmc.replay_rewards("unbounded", np.zeros(4), np.zeros((1, 1))),
     ):
         with pytest.raises(UserError, match=message):

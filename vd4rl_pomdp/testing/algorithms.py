@@ -145,7 +145,7 @@ def a_loss_moves_what_its_optimiser_steps(name: str, **options: Any) -> None:
     claim(not still, f"after {UPDATES} updates, these were not trained, or should not have been: {listed(still)}")
 
 
-def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) -> None:
+def only_the_first_loss_reaches_the_representations(name: str, **options: Any) -> None:
     """Only the first loss, which trains an encoder that is not frozen, has a gradient to `batch.z`.
 
     The encoder's optimiser steps along it.
@@ -162,7 +162,7 @@ def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) 
     claim(scale.item() != 1, "the encoder's optimiser takes no step: pass it to `minimise` with the first loss")
 
 
-def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) -> None:
+def targets_move_by_tau_and_nothing_else_moves_by_itself(name: str, **options: Any) -> None:
     """A `target_x` moves towards x by a factor `tau` per update; everything else changes only by optimiser steps."""
     algorithm = make(name, **options)
     targets = {part: module for part, module in _modules(algorithm).items() if part.startswith("target_")}
@@ -184,7 +184,7 @@ def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) ->
     claim(crept == targets.keys(), f"the targets are {listed(targets)}, but {listed(crept)} moved")
 
 
-def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **options: Any) -> None:
+def a_resumed_algorithm_takes_the_same_steps(name: str, **options: Any) -> None:
     """After loading a state dict, an algorithm takes bit-identical steps, independent of torch's global random
     state."""
     one, other = (make(name, seed=seed, **options) for seed in (0, 1))
@@ -288,9 +288,9 @@ def a_batch_is_left_as_it_was(name: str, **options: Any) -> None:
 CHECKS: tuple[Check, ...] = (
     losses_are_finite_scalars,
     a_loss_moves_what_its_optimiser_steps,
-    the_first_loss_alone_reaches_the_representations,
-    targets_creep_and_nothing_else_moves_by_itself,
-    an_algorithm_that_goes_on_elsewhere_takes_the_same_steps,
+    only_the_first_loss_reaches_the_representations,
+    targets_move_by_tau_and_nothing_else_moves_by_itself,
+    a_resumed_algorithm_takes_the_same_steps,
     stacks_take_the_steps_of_single_runs,
     actions_lie_within_their_bounds,
     a_batch_is_left_as_it_was,

@@ -73,7 +73,7 @@ def equal_keys_give_equal_masks(name: str, **options: Any) -> None:
     claim(torch.equal(windows.view_as(whole), whole), "a stack looks different in windows than in a batch")
 
 
-def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
+def draws_depend_only_on_keys(name: str, **options: Any) -> None:
     """Randomness comes from the keys only: repeated calls and other torch or numpy seeds give the same pixels."""
     seen = []
     for seed in (1, 2):
@@ -84,7 +84,7 @@ def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
     claim(all(torch.equal(seen[0], other) for other in seen), "equal keys gave different pixels")
 
 
-def frames_that_are_dropped_stay_dropped(name: str, **options: Any) -> None:
+def dropped_frames_stay_dropped(name: str, **options: Any) -> None:
     """Dropped frames stay black, and their content does not leak into other frames."""
     if name == "none":
         return
@@ -169,8 +169,8 @@ CHECKS: tuple[Check, ...] = (
     pixels_stay_pixels,
     something_changes,
     equal_keys_give_equal_masks,
-    draws_depend_on_keys_alone,
-    frames_that_are_dropped_stay_dropped,
+    draws_depend_only_on_keys,
+    dropped_frames_stay_dropped,
     emission_never_changes_a_row,
     the_environment_shows_what_the_data_show,
     a_view_shows_shifted_then_corrupted_stacks,

@@ -63,7 +63,7 @@ def features_have_one_shape(name: str, **options: Any) -> None:
     claim_close(floats, flat, "float images give other features than uint8", 1e-5)
 
 
-def pictures_are_not_mixed(name: str, **options: Any) -> None:
+def images_are_not_mixed(name: str, **options: Any) -> None:
     """The features of an image depend on that image alone, not on the rest of the batch, in train and eval mode."""
     obs = pictures(3, options["size"]).float().requires_grad_()
     for training in (False, True):
@@ -99,7 +99,7 @@ def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
 
 CHECKS: tuple[Check, ...] = (
     features_have_one_shape,
-    pictures_are_not_mixed,
+    images_are_not_mixed,
     gradients_reach_all_parameters,
     a_seed_decides_everything,
     a_folder_gives_back_the_encoder,

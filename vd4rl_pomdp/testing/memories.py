@@ -86,7 +86,7 @@ def streaming_equals_batch(name: str, **options: Any) -> None:
             claim_close(streamed(encoder, window), encoder.encode(window), f"they differ for {method}", 1e-5)
 
 
-def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
+def a_state_depends_only_on_its_past(name: str, **options: Any) -> None:
     """An output depends on its own row and on earlier rows of its window only.
 
     For a memory with a `reach`, on that many rows at most.
@@ -165,7 +165,7 @@ def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
 CHECKS: tuple[Check, ...] = (
     outputs_have_one_shape,
     streaming_equals_batch,
-    a_state_depends_on_its_past_alone,
+    a_state_depends_only_on_its_past,
     actions_are_read_where_a_method_has_them,
     observations_are_read_where_it_says,
     padding_is_not_read,

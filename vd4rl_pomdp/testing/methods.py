@@ -152,7 +152,7 @@ def _train(name: str, objective: Objective, optimiser: torch.optim.Optimizer, ba
     return losses
 
 
-def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings: Any) -> None:
+def a_resumed_training_takes_the_same_steps(name: str, **settings: Any) -> None:
     """After restoring a checkpoint, training continues bit-identically, independent of torch's global random state."""
     here = build(name, **settings)
     optimiser = torch.optim.Adam(here.parameters(), lr=1e-3)
@@ -187,7 +187,7 @@ def padding_changes_no_loss(name: str, **settings: Any) -> None:
     claim_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0], "leave out rows beyond `real`")
 
 
-def every_action_target_is_taken(name: str, **settings: Any) -> None:
+def every_action_target_is_accepted(name: str, **settings: Any) -> None:
     """A method that predicts actions has a finite loss with every action target."""
     for target in ACTION_TARGETS:
         read = {field.name for field in fields(target_options(target))}
@@ -257,12 +257,12 @@ TRAINED: tuple[Check, ...] = (
     a_loss_is_a_finite_scalar,
     a_loss_moves_the_whole_encoder,
     steps_lower_the_loss,
-    a_training_that_goes_on_elsewhere_takes_the_same_steps,
+    a_resumed_training_takes_the_same_steps,
     padding_changes_no_loss,
 )
 """For trained methods."""
 INVERSE: tuple[Check, ...] = (
-    every_action_target_is_taken,
+    every_action_target_is_accepted,
     optional_terms_are_added,
     the_action_loss_is_that_of_each_pairs_first_action,
     predictions_depend_on_what_is_declared,
