@@ -125,14 +125,6 @@ def test_invalid_names_are_rejected_before_any_request(mirror, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_unreachable_endpoint_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setenv("NO_PROXY", "*")
-    monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
-    with pytest.raises(UserError, match=r"cannot be fetched .*choose another --endpoint"):
-        download("walker_walk", "expert", tmp_path, endpoint="http://127.0.0.1:9")
-    assert not [path for path in tmp_path.rglob("*.hdf5")]
-
-
 def test_token_is_sent_only_to_configured_hub(mirror, tmp_path, monkeypatch):
     given = []
     monkeypatch.setattr(module, "hf_hub_download", lambda *words, token, **options: given.append(token) or "/nowhere")
@@ -144,17 +136,19 @@ def test_token_is_sent_only_to_configured_hub(mirror, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("endpoint", "message"),
     [
-        (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is not an address"),
-        (("walker_walk", "expert", "http://["), r"endpoint 'http://\[' is not an address"),
+        ("hf.co", "endpoint 'hf.co' is not an address"),
+        ("http://[", r"endpoint 'http://\[' is not an address"),
+        ("http://127.0.0.1:9", "cannot be fetched .*choose another --endpoint"),
     ],
 )
-def test_unpublished_sets_and_bad_endpoints_are_rejected(tmp_path, arguments, message):
-    task, quality, *endpoint = arguments
+def test_bad_and_unreachable_endpoints_are_rejected(tmp_path, monkeypatch, endpoint, message):
+    monkeypatch.setenv("NO_PROXY", "*")
+    monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
     with pytest.raises(UserError, match=message):
-        download(task, quality, tmp_path, *endpoint)
-    assert not list(tmp_path.iterdir())
+        download("walker_walk", "expert", tmp_path, endpoint)
+    assert not list(tmp_path.rglob("*.hdf5"))
 
 
 @pytest.mark.usefixtures("mirror", "own_cache")

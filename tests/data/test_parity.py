@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from tests.helpers_data import fake_rows, write_fake_set, write_rows
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import parity
 from vd4rl_pomdp.data.parity import canary_frames, check_parity, compare, golden_tasks, render_info
@@ -31,14 +32,8 @@ def test_fast_rendering_mean_difference_is_below_a_twentieth(exact, task):
     assert 0 < difference < 0.05
 
 
-@pytest.fixture
-def unrepaired(monkeypatch):
-    """Environments with the skybox of the installed mujoco."""
+def test_canary_fails_without_skybox_repair(monkeypatch):
     monkeypatch.setattr(rendering, "prepare", lambda physics, render, size: None)
-
-
-@pytest.mark.usefixtures("unrepaired")
-def test_canary_fails_without_skybox_repair():
     result = check_parity()
     assert not result["equal"]
     assert not result["canary"]["walker_walk"]["equal"]
@@ -53,55 +48,27 @@ def test_render_info_names_versions_and_renderer(exact):
     assert info["mujoco"].startswith("3.")
 
 
-class FakeSet:
-    """The attributes of a dataset that parity reads."""
-
-    def __init__(self, task, frames):
-        self.task, self.num_rows, self.frames, self.frame_size = task, len(frames), self, 84
-        self._frames = frames
-
-    def numpy(self):
-        return self._frames
-
-
-@pytest.fixture(scope="module", params=["walker_walk", "cheetah_run"])
-def own_frames(request):
-    return request.param, parity._wandering_frames(request.param, 84, 40)
-
-
-def background(monkeypatch, task, data, rendered):
-    monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(task, data))
-    monkeypatch.setattr(parity, "_wandering_frames", lambda task, size: rendered)
-    return parity._compare_background("somewhere")
-
-
-def test_background_of_own_frames_is_equal(monkeypatch, own_frames):
-    task, frames = own_frames
-    result = background(monkeypatch, task, frames[:30], frames[10:])
-    assert result["equal"]
-    assert result["static_pixels"] > 1000
-
-
-def test_background_under_another_sky_differs(monkeypatch, own_frames):
-    task, frames = own_frames
-    with monkeypatch.context() as patch:
-        patch.setattr(rendering, "prepare", lambda physics, render, size: None)
-        others = parity._wandering_frames(task, 84, 40)
-    assert not background(monkeypatch, task, others, frames)["equal"]
-
-
-def test_background_of_set_overrides_canaries(monkeypatch):
+@pytest.mark.parametrize("task", ["walker_walk", "cheetah_run"])
+def test_background_of_a_set_decides(tmp_path, own_cache, monkeypatch, task):
     """A GPU renders other canaries, but the same pixels as a set rendered on a GPU."""
-    for name in ("canary_frames", "render_info"):
-        monkeypatch.setattr(parity, name, lambda *task: None)
-    for equal in (False, True):
-        monkeypatch.setattr(parity, "_compare_background", lambda path, equal=equal: {"equal": equal})
-        monkeypatch.setattr(parity, "compare", lambda *frames, equal=equal: {"equal": not equal})
-        assert check_parity("somewhere")["equal"] is equal
-        assert check_parity()["equal"] is not equal
+    sets = {}
+    for name in ("ours", "other sky"):
+        with monkeypatch.context() as patch:
+            if name == "other sky":
+                patch.setattr(rendering, "prepare", lambda physics, render, size: None)
+            frames = parity._wandering_frames(task, 84, 40)
+        sets[name] = write_rows(tmp_path / task / name, fake_rows([40]) | {"observation": frames})
+    canaries = {name: value for name, value in parity._golden().items() if name.endswith("/frames")}
+    monkeypatch.setattr(parity, "canary_frames", lambda name, env=None: canaries[f"{name}/frames"] // 2)
+    result = check_parity(sets["ours"])
+    assert result["equal"]
+    assert result["background"]["static_pixels"] > 1000
+    assert not check_parity()["equal"]
+    monkeypatch.setattr(parity, "canary_frames", lambda name, env=None: canaries[f"{name}/frames"])
+    assert not check_parity(sets["other sky"])["equal"]
+    assert check_parity()["equal"]
 
 
-def test_parity_of_unknown_task_is_rejected(monkeypatch):
-    monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(None, np.zeros((2, 3, 84, 84), np.uint8)))
+def test_parity_of_unknown_task_is_rejected(tmp_path, own_cache):
     with pytest.raises(UserError, match="cannot determine the task"):
-        parity._compare_background("somewhere")
+        check_parity(write_fake_set(tmp_path / "set"))

@@ -14,23 +14,24 @@ LENGTHS = (9, 5)
 
 @pytest.fixture
 def dataset(tmp_path) -> Dataset:
-    return open_dataset(write_fake_set(tmp_path / "set", LENGTHS), tmp_path / "cache")
-
-
-def generator() -> RandomStream:
-    return RandomStream(torch.Generator().manual_seed(0))
+    """Two episodes of random pixels."""
+    dataset = open_dataset(write_fake_set(tmp_path / "set", LENGTHS), tmp_path / "cache")
+    g = torch.Generator().manual_seed(0)
+    dataset.frames = torch.randint(0, 256, dataset.frames.shape, dtype=torch.uint8, generator=g)
+    return dataset
 
 
 MAKE = {
-    "windows": lambda view: WindowSampler(view, 4, 3, generator()),
-    "transitions": lambda view: TransitionSampler(view, 4, generator(), n_step=2),
+    "windows": lambda view, draws: WindowSampler(view, 4, 3, draws),
+    "transitions": lambda view, draws: TransitionSampler(view, 4, draws, n_step=2),
 }
 
 
 @pytest.mark.parametrize("kind", MAKE)
 def test_sampler_state_determines_next_batches(dataset, kind):
     def sampler():
-        return MAKE[kind](View(dataset, CorruptionConfig.of("patch+zero_frames"), 4, 3, "test"))
+        view = View(dataset, CorruptionConfig.of("patch+zero_frames"), 4, 3, "test")
+        return MAKE[kind](view, RandomStream(torch.Generator().manual_seed(0)))
 
     first, second = sampler(), sampler()
     for _ in range(3):
@@ -52,9 +53,6 @@ def test_view_name_determines_random_stream(dataset):
 
 
 def test_window_shares_one_random_shift(dataset):
-    dataset.frames = torch.randint(
-        0, 256, dataset.frames.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
-    )
     view = View(dataset, None, 4)
     rows = torch.tensor([[2, 2, 2], [2, 2, 2], [3, 3, 3]])
     seen = view.observe(rows)
@@ -67,9 +65,6 @@ def test_window_shares_one_random_shift(dataset):
 @pytest.mark.parametrize("by_lines", [True, False])
 def test_observations_can_be_shifted_independently(dataset, monkeypatch, corruption, by_lines):
     """The frames of one observation still share a shift, and both implementations agree."""
-    dataset.frames = torch.randint(
-        0, 256, dataset.frames.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
-    )
     if not by_lines:
         monkeypatch.setattr(augmentation, "by_lines", lambda images, pad: False)
     view = View(dataset, CorruptionConfig.of(corruption), 4, shared="observation")

@@ -88,24 +88,6 @@ def test_frames_are_copied_from_reused_buffers(shape):
         assert row.frame.flags.c_contiguous
 
 
-def test_gymnasium_frames_do_not_depend_on_other_environments():
-    """Gymnasium renders into the current OpenGL context if the environment has one viewer."""
-    others = []
-
-    def three_frames(disturbed):
-        env = make_env(GymnasiumTask("HalfCheetah-v5"))
-        env.reset(1)
-        for _ in range(3):
-            if disturbed:
-                others.append(make_env(TASKS["walker_walk"]))
-                others[-1].reset(1)
-            yield env.step(np.ones(6, np.float32)).frame
-
-    expected = list(three_frames(False))
-    assert (expected[0] != expected[-1]).any()
-    np.testing.assert_array_equal(list(three_frames(True)), expected)
-
-
 def test_actions_are_repeated_and_rewards_summed():
     rows = play(GymnasiumTask(Counter, action_repeat=3), 2)
     assert [row.reward for row in rows] == [0, 1 + 2 + 3, 4 + 5 + 6]
