@@ -113,8 +113,6 @@ def write_rounded(run: Path, folder: Path) -> None:
     UserError for a missing or damaged file, or a weight that overflows float16.
     """
     for name in FILES:
-        with disk_errors(folder):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
         try:
             content = read_bytes(run / name)
             if name.endswith(".safetensors"):

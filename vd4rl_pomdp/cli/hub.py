@@ -10,7 +10,7 @@ import tyro
 
 from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
-from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder
+from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -106,7 +106,5 @@ def play(
         low, high = mean_interval(values) or (None, None)
         print(f"  {name:<38} {with_interval(values.mean(), low, high, 0)}")
     if film:
-        with disk_errors(film.parent):
-            film.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(film, films.side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
         print(f"film: {film}")

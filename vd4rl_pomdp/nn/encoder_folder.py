@@ -45,8 +45,6 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
     """Write each file atomically, config.json last: without it a folder does not count as an encoder folder."""
-    with disk_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / WEIGHTS, weights)
     write_bytes(folder / CARD, model_card(record).encode())
     write_json(folder / CONFIG, asdict(record))

@@ -10,7 +10,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.random import fork_rng
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line
+from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.reading import damaged, read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
@@ -65,8 +65,6 @@ class Policy(nn.Module):
     def save(self, folder: Path | str, step: int | None = None) -> None:
         """Write the policy folder; if given, the training step `step` is stored with the weights."""
         folder = Path(folder)
-        with disk_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
         weights = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}
         write_bytes(folder / _WEIGHTS, save(weights, None if step is None else {_STEP: str(step)}))
         write_json(folder / _SHAPE, self.shape)

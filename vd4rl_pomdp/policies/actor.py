@@ -19,7 +19,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.reading import parse_json, read_bytes, safetensors_metadata
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs.make import layout_of
@@ -108,8 +108,6 @@ class Ladder:
 
 
 def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> None:
-    with disk_errors(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {k: np.ascontiguousarray(v) for k, v in weights.items()}
     write_bytes(path, save(arrays, {"card": json.dumps(card)}))
 

@@ -15,7 +15,7 @@ import torch
 import tyro
 from PIL import Image
 
-from vd4rl_pomdp.core.errors import MAX_SEED, UserError, disk_errors, refuse_no_folder, refuse_outside
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.core.options import Options, StageConfig, flat
 from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.tasks import FRAME_STACK
@@ -84,8 +84,6 @@ def write_view(config: ViewConfig) -> Path:
     rows = min(longest, max(2, int(MOST_BYTES / count / trial)))
     while len(page := _page(config, view, shown, rows)) > MOST_BYTES and rows > 2:
         rows = max(2, int(0.95 * rows * MOST_BYTES / len(page)))
-    with disk_errors(config.out):
-        config.out.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(config.out, page)
     return config.out
 

@@ -36,7 +36,6 @@ class Checkpoints:
         """Save a state reached after `seconds` as the checkpoint of `step`, and delete all but the newest KEPT."""
         content = pack({"format": FORMAT, "seconds": round(seconds, 2), "state": state})
         with disk_errors(self._folder):
-            self._folder.mkdir(parents=True, exist_ok=True)
             write_bytes(self._folder / f"{step}.pt", content)
             synchronise(self._folder)  # before deleting the oldest: otherwise a power cut could lose both
             self.prune(KEPT)

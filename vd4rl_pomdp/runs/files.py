@@ -74,12 +74,14 @@ def write_bytes(path: Path, content: bytes) -> None:
 def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
     """Yield a hidden temporary path next to `path`, renamed to `path` when the block ends and deleted if it fails.
 
-    If several processes may write it at once (`shared`), each has its own temporary name, which is left behind if the
-    process is killed. UserError if the disk is full, or the system refuses for another reason.
+    Its folder is created if needed. If several processes may write it at once (`shared`), each has its own temporary
+    name, which is left behind if the process is killed. UserError if the disk is full, or the system refuses for
+    another reason.
     """
     own = f".{secrets.token_hex(4)}" if shared else ""
     fresh = path.with_name(f".{path.name}{own}.tmp")
     with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield fresh
             # Flush the content before renaming, or a power cut could leave the name with an empty file.

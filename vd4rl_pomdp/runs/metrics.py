@@ -178,7 +178,6 @@ class Wandb:
 
         folder, online = run.path / "wandb", run.config["wandb"] == "online"
         if not (folder / "id").exists():  # random: two runs of one recipe are two wandb runs
-            folder.mkdir(parents=True, exist_ok=True)
             write_bytes(folder / "id", secrets.token_hex(8).encode())
         name = (folder / "id").read_text(encoding="ascii").strip()
         for earlier in folder.glob(f"offline-run-*-{name}"):  # `wandb sync` rejects the files of a killed process

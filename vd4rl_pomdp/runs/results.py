@@ -20,7 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import damaged, fits, parse_json, read_bytes
 from vd4rl_pomdp.core.tasks import TASKS
@@ -269,8 +269,6 @@ def read_results(folder: Path | str) -> list[Result]:
 def write_results(out: Path, runs: Iterable[Result]) -> None:
     """Write runs as a results folder, replacing its previous runs. Readers see each file whole."""
     runs = list(runs)
-    with disk_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
     with replacing_file(out / RUNS) as fresh:
         with fresh.open("w", encoding="utf-8") as file:
             for run in runs:

@@ -68,8 +68,6 @@ class SweepFolder:
     def keep_plan(self, name: str, jobs: Iterable[Job], program: Iterable[str] = ()) -> Plan:
         """Write a plan, replacing an earlier one of that name. Safe when several drivers write at once."""
         plan = Plan(list(jobs), Path.cwd(), self.out, list(program))
-        with disk_errors(self.path):
-            (self.path / "plans").mkdir(parents=True, exist_ok=True)
         write_json(self.path / "plans" / f"{name}.json", jsonable(asdict(plan)), shared=True)
         return plan
 
