@@ -6,14 +6,14 @@ from pathlib import Path
 
 from finetune.evaluation import Episode, episode_rows, evaluate, jobs_of, own_and_none
 from vd4rl_pomdp.agents import CARD, checksums, find_agent, write_rounded
-from vd4rl_pomdp.core.errors import UserError, refuse_no_folder, refuse_number
+from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.tasks import MOST_EPISODES, TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.nn.encoder_folder import read_record
-from vd4rl_pomdp.runs.files import Row, holds_anything, read_json, write_json
-from vd4rl_pomdp.runs.outputs import built, refuse_inside
+from vd4rl_pomdp.runs.files import Row, read_json, write_json
+from vd4rl_pomdp.runs.outputs import built
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import read_run
 
@@ -29,18 +29,16 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
-    refuse_inside(out)
-    refuse_no_folder(out)
-    if holds_anything(out):
-        raise UserError(f"{out}: is not empty; choose another --out")
-    trained = read_run(run)
-    if trained.record["stage"] != "finetune" or not trained.finished or trained.diverged:
-        raise UserError(f"{run}: is not a finished fine-tuning run; name a folder that `vd4rl-pomdp finetune` wrote")
-    encoder, config = read_record(run / "encoder"), trained.record["config"]
-    about = encoder.pretrain
-    length = min(config["eval_length"], TASKS.named(about.task).decisions)
-    under = own_and_none(CorruptionConfig.fill(about.corruption))
     with built(out) as made:
+        trained = read_run(run)
+        if trained.record["stage"] != "finetune" or not trained.finished or trained.diverged:
+            raise UserError(
+                f"{run}: is not a finished fine-tuning run; name a folder that `vd4rl-pomdp finetune` wrote"
+            )
+        encoder, config = read_record(run / "encoder"), trained.record["config"]
+        about = encoder.pretrain
+        length = min(config["eval_length"], TASKS.named(about.task).decisions)
+        under = own_and_none(CorruptionConfig.fill(about.corruption))
         write_rounded(run, made)
         card = {name: trained.labels[name] for name in LABELS} | {
             "data": trained.record["inputs"]["data"],

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
+from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES, TASKS, DMCTask
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import PLAN
@@ -106,10 +106,6 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     if form.write is None:
         writable = [other for other, one in FORMATS.items() if one.write]
         raise UserError(f"the format {name!r} cannot be written: choose one of {', '.join(writable)}")
-    refuse_inside(out)
-    refuse_no_folder(out)
-    if holds_anything(out):
-        raise UserError(f"{out}: is not empty; choose another --out")
     opened = _resized(read_shards(str(path)), size)
     progress = ProgressLine("export", opened.episodes, "episodes")
 

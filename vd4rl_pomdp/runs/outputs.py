@@ -16,9 +16,10 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_error, disk_errors
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_error, disk_errors, refuse_no_folder
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import CONFIG_FILE
+from vd4rl_pomdp.runs.files import holds_anything
 from vd4rl_pomdp.runs.interrupt import handled
 
 LOCK = ".lock"
@@ -127,8 +128,13 @@ def built(out: Path) -> Iterator[Path]:
     """Yield the absolute path of a folder to create, which becomes `out` at the end: `out` is never incomplete.
 
     It lies in a hidden folder next to `out`, locked against other processes. If the block fails, nothing remains; what
-    a killed process leaves is replaced by the next one. `out` may exist if it holds nothing but hidden files.
+    a killed process leaves is replaced by the next one. `out` may exist if it holds nothing but hidden files; else
+    UserError.
     """
+    refuse_inside(out)
+    refuse_no_folder(out)
+    if holds_anything(out):
+        raise UserError(f"{out}: is not empty; choose another --out")
     absolute = Path(os.path.abspath(out))
     hidden = absolute.with_name(f".{absolute.name}.export")
     made = hidden / "new"
