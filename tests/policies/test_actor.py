@@ -65,23 +65,21 @@ def test_invalid_actor_files_are_rejected(tmp_path, monkeypatch):
         load_ladder("humanoid_walk")
 
 
-def spoil(weights, how):
-    if how == "none":
-        return {"x": np.zeros(3, np.float32)}
-    if how == "narrow":
-        return weights | {"hidden.0.weight": weights["hidden.0.weight"][:20]}
-    if how == "wide":
-        return weights | {f"{n}.{k}": np.repeat(weights[f"{n}.{k}"], 2, -1) for n in HEADS for k in ("weight", "bias")}
-    return weights | {"log_std.bias": np.full_like(weights["log_std.bias"], np.nan)}
-
-
 HEADS = ("mean", "log_std")
+SPOILT = {
+    "none": lambda weights: {"x": np.zeros(3, np.float32)},
+    "narrow": lambda weights: weights | {"hidden.0.weight": weights["hidden.0.weight"][:20]},
+    "wide": lambda weights: (
+        weights | {f"{n}.{k}": np.repeat(weights[f"{n}.{k}"], 2, -1) for n in HEADS for k in ("weight", "bias")}
+    ),
+    "nan": lambda weights: weights | {"log_std.bias": np.full_like(weights["log_std.bias"], np.nan)},
+}
 
 
-@pytest.mark.parametrize("how", ["none", "narrow", "wide", "nan"])
-def test_unfit_actor_weights_are_rejected(tmp_path, how):
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_unfit_actor_weights_are_rejected(tmp_path, spoil):
     shipped, path = load_actor("walker_walk", "medium"), tmp_path / "actor.safetensors"
-    Actor(spoil(shipped.weights, how), shipped.card).save(path)
+    Actor(spoil(shipped.weights), shipped.card).save(path)
     with pytest.raises(UserError, match="its weights do not fit an actor of walker_walk"):
         read_actor(path, "walker_walk")
 

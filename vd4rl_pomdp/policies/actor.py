@@ -33,16 +33,26 @@ _REMEDY = "use another copy"
 
 
 @dataclass(frozen=True)
-class Actor:
-    """A stochastic policy on simulator states."""
+class _Weights:
+    """The content of a file of actors."""
 
     weights: dict[str, np.ndarray]
-    """float32 matrices (in, out), each with a `.bias`: `hidden.{i}.weight`, `mean.weight` and `log_std.weight`;
-    optionally `observation.mean` and `observation.std` (D,)."""
     card: dict[str, Any]
-    """How it was trained: task, quality, training step, mean return of 20 episodes, config, versions."""
     sha256: str = ""
     """Hash of the file that it was read from."""
+
+    def save(self, path: Path) -> None:
+        arrays = {k: np.ascontiguousarray(v) for k, v in self.weights.items()}
+        write_bytes(path, save(arrays, {"card": json.dumps(self.card)}))
+
+
+class Actor(_Weights):
+    """A stochastic policy on simulator states.
+
+    Its weights are float32 matrices (in, out), each with a `.bias`: `hidden.{i}.weight`, `mean.weight` and
+    `log_std.weight`; optionally `observation.mean` and `observation.std` (D,). Its card says how it was trained: task,
+    quality, training step, mean return of 20 episodes, config, versions.
+    """
 
     def act(self, state: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """Action (A,) float32 in [-1, 1] for dm_control's flattened observations (D,); without `rng` its mean."""
@@ -66,20 +76,13 @@ class Actor:
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._double[f"{name}.weight"] + self._double[f"{name}.bias"]
 
-    def save(self, path: Path) -> None:
-        _save(self.weights, self.card, path)
 
+class Ladder(_Weights):
+    """Checkpoints of an actor along one training run; playing them in turn imitates the run's replay buffer.
 
-@dataclass(frozen=True)
-class Ladder:
-    """Checkpoints of an actor along one training run; playing them in turn imitates the run's replay buffer."""
-
-    weights: dict[str, np.ndarray]
-    """As `Actor.weights`, but float16 and stacked along a new first axis, one entry per checkpoint ("rung")."""
-    card: dict[str, Any]
-    """Task, `decisions` at each rung, and the return at each, `curve`."""
-    sha256: str = ""
-    """Hash of the file that it was read from."""
+    Its weights are those of an `Actor`, but float16 and stacked along a new first axis, one entry per checkpoint
+    ("rung"). Its card has the task, `decisions` at each rung, and the return at each, `curve`.
+    """
 
     @classmethod
     def of(cls, actors: list[Actor], card: dict[str, Any]) -> Ladder:
@@ -102,14 +105,6 @@ class Ladder:
         steps = np.array([0, *self.card["decisions"]])
         nearest = int(np.abs(steps - progress * steps[-1]).argmin())
         return self.rungs[nearest - 1] if nearest else None
-
-    def save(self, path: Path) -> None:
-        _save(self.weights, self.card, path)
-
-
-def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> None:
-    arrays = {k: np.ascontiguousarray(v) for k, v in weights.items()}
-    write_bytes(path, save(arrays, {"card": json.dumps(card)}))
 
 
 def read_actor(path: Path, task: str | None = None) -> Actor:
