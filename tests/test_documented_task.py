@@ -150,14 +150,13 @@ def test_invalid_tasks_are_rejected_on_registration(tasks, task, message):
 def test_too_small_frames_are_rejected_before_training(tasks, tmp_path):
     data = tmp_path / "centre"
     collect(CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=16), 8)
-    base = PretrainConfig.of("smoke", data=data, out=tmp_path / "run")
     for changes, message in (
         ({"corruption": "patch", "patch_size": 17}, r"patch size 17 exceeds the image \(16x16\)"),
         ({"shift": 16}, "--shift is 16; it must be at least 0 and at most 15"),
         ({"frame_encoder": "nature"}, "frame encoder 'nature' cannot read images of 16x16 pixels"),
     ):
         with pytest.raises(UserError, match=message):
-            run_pretrain(base.altered(**changes))
+            run_pretrain(PretrainConfig.of("smoke", data=data, out=tmp_path / "run", **changes))
         assert not (tmp_path / "run").exists()
 
 

@@ -23,6 +23,7 @@ from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import write_shard
@@ -177,7 +178,7 @@ def test_metric_rows_are_means_since_the_previous_row(stage, tmp_path, monkeypat
     run, config, learner = stage
     config = replace(config(tmp_path / "run"), log_every=4, checkpoint_every=3)
     if learner is bc.BC:
-        config, learner = config.altered(algorithm="td3_bc"), td3_bc.TD3BC
+        config, learner = type(config).of(**flat(config) | {"algorithm": "td3_bc"}), td3_bc.TD3BC
     update, steps = learner.update, []
 
     def watched(self, *arguments):

@@ -89,14 +89,6 @@ def test_unknown_preset_lists_the_choices(kind):
         kind.of("large")
 
 
-def test_altered_config_keeps_explicit_settings():
-    config = PretrainConfig.of("smoke", method="mik+a", max_k=2, corruption="patch", patch_size=8, seed=3)
-    other = config.altered(method="driml")
-    assert other == PretrainConfig.of("smoke", method="driml", max_k=2, corruption="patch", patch_size=8, seed=3)
-    with pytest.raises(UserError, match="--max-k is not read by the method curl"):
-        config.altered(method="curl")
-
-
 @pytest.mark.parametrize(("max_k", "window"), [(8, 8), (31, 8)])
 def test_max_k_beyond_the_window_is_rejected(max_k, window):
     with pytest.raises(UserError, match=f"--max-k {max_k} needs windows of more"):

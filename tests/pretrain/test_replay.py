@@ -31,8 +31,7 @@ def states(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(folder: Path, method: str, steps: int, device: str = "cpu", noise: float = 0.0) -> tuple[Trainer, list]:
     """A trainer after `steps`, and its scalars, read at the end; `noise` perturbs its initial weights."""
     config = PretrainConfig.of("smoke", method=method, data=folder, out=folder, corruption="patch+zero_frames")
-    if "l2_states" in vars(config.options):
-        config = config.altered(l2_states=0.1)
+    config = config.with_known(l2_states=0.1)
     dataset = open_dataset(folder, folder.parent / "cache")
     objective = make_objective(dataset, config).to(pick_device(device))
     dataset.to(device)

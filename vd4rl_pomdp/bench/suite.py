@@ -299,15 +299,19 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     return results | {"bf16_over_fp32": steps["fp32"] / steps["bf16"]}
 
 
+def _pretraining(folder: Path, **settings: Any) -> PretrainConfig:
+    return PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames", **settings)
+
+
 def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     """Step time and frames/s of every method in the cpu preset, and how K and the resolution affect MIK+A's step time.
 
     Methods that regress states are left out: a synthetic dataset has none.
     """
-    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
+    config = _pretraining(folder)
 
     def step(**settings: Any) -> Callable[[], Any]:
-        return make_trainer(dataset, config.altered(**settings)).update
+        return make_trainer(dataset, _pretraining(folder, **settings)).update
 
     results: dict[str, Any] = {}
     for name in (name for name, method in METHODS.items() if method.trained and not method.regresses_state):
@@ -320,8 +324,7 @@ def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
 def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
     """Pretraining step and streaming row of MIK+A in the cpu preset with each other memory, relative to the GRU."""
-    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
-    trainers = [make_trainer(dataset, config.altered(history=name)) for name in MEMORIES]
+    trainers = [make_trainer(dataset, _pretraining(folder, history=name)) for name in MEMORIES]
     obs, action = View(dataset).stacks(torch.tensor([3], device=dataset.t.device)), dataset.action[3:4]
 
     @torch.no_grad()

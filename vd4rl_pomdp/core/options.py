@@ -109,28 +109,10 @@ class StageConfig:
         """Raise UserError for invalid settings, before anything is read or written."""
         _check_options(self)
 
-    def altered(self, **changes: Any) -> Self:
-        """A copy with other settings or plug-ins. Settings that differ from the preset's defaults are kept.
-
-        UserError if one of these is not read by the newly chosen plug-ins.
-        """
-        usual = self.usual()
-        changed = {name: value for name, value in flat(self).items() if value != usual.get(name)}
-        return type(self).of(**({"preset": self.preset} | self._chosen() | changed | changes))
-
     def with_known(self, **settings: Any) -> Self:
         """A copy with those of the given settings that exist here, e.g. sizes, whatever plug-ins are chosen."""
         known = flat(self)
-        return self.altered(**{name: value for name, value in settings.items() if name in known})
-
-    def usual(self) -> dict[str, Any]:
-        """The settings if only preset and plug-ins had been chosen."""
-        return flat(type(self).of(self.preset, **self._chosen()))
-
-    def _chosen(self) -> dict[str, Any]:
-        """The chosen plug-ins, except those named in another plug-in's options."""
-        own = flat(type(self)())
-        return {name: value for name, value in flat(self).items() if name in self.choosers and name in own}
+        return type(self).of(**(known | {name: value for name, value in settings.items() if name in known}))
 
 
 def options_in(value: Any) -> tuple[Options, ...] | None:

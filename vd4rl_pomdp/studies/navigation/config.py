@@ -155,7 +155,8 @@ class NavigationConfig(TrainingConfig):
 
 def command_of(config: NavigationConfig) -> list[str]:
     """The command that trains with a config: the preset, and every flag that differs from it."""
-    usual = config.usual() | config.defaults(config.preset)
+    chosen = {name: getattr(config, name) for name in ("method", "frame_encoder", "exogenous")}
+    usual = flat(config.of(config.preset, **chosen)) | config.defaults(config.preset)
     untold = ("preset", "device", "wandb", "tensorboard")
     changed = {name: value for name, value in flat(config).items() if name not in untold and value != usual.get(name)}
     return ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset, *words_of(changed)]
