@@ -31,7 +31,6 @@ EVALUATION = "eval/"  # prefix of an evaluation's metrics: eval/return/CORRUPTIO
 PROJECT = "vd4rl-pomdp"
 INIT_TIMEOUT_S, FINISH_TIMEOUT_S = 30.0, 60.0
 """Seconds that wandb may wait for its server before the first row and after the last one."""
-LONGEST = {"name": 128, "group": 128, "tags": 64}  # maximum lengths that wandb accepts, in characters
 _MOST_ADDED = 1024  # steps buffered before their scalars are summed
 Metrics = Mapping[str, float]  # one row: `step`, and numbers by name
 
@@ -211,13 +210,14 @@ class Wandb:
 
 def wandb_names(run: RunFolder, labels: Mapping[str, Any], card: Mapping[str, Any]) -> dict[str, Any]:
     """wandb's `name`, `tags` and `group` of a run; seeds of one experiment share the group."""
-    words = [str(value) for name, value in labels.items() if name != "seed" and value != ""]
+    words = [run.stage, *(str(value) for name, value in labels.items() if name != "seed" and value != "")]
     mark = recipe({"stage": run.stage, "config": run.config}, card, seeds=False)[:6]
-    title = " ".join([run.stage, *words])
-    group = f"{title[: LONGEST['group'] - 7]} {mark}"
-    seed = f" seed {run.config['seed']}"
-    tags = [tag[: LONGEST["tags"]] for tag in dict.fromkeys([run.stage, *words])]
-    return {"group": group, "name": title[: LONGEST["name"] - len(seed)] + seed, "tags": tags}
+    title = " ".join(words)
+    return {
+        "group": f"{title} {mark}",
+        "name": f"{title} seed {run.config['seed']}",
+        "tags": list(dict.fromkeys(words)),
+    }
 
 
 class TensorBoard:
