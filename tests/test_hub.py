@@ -216,15 +216,6 @@ def test_damaged_download_is_fetched_again(hub, encoder, tmp_path):
     assert lists(tmp_path) == ["new", "run"]
 
 
-def test_interrupted_transfer_is_resumed(hub, encoder, tmp_path, monkeypatch):
-    monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 1000)
-    push(encoder, ENCODER)
-    hub.cut["model.safetensors"] = 1
-    pull(ENCODER, tmp_path / "new")
-    assert hub.ranges == ["model.safetensors"]
-    assert content(tmp_path / "new") == content(encoder)
-
-
 FOREIGN = {
     "a file": lambda path: path.write_text("mine"),
     "a link": lambda path: path.symlink_to("nowhere"),
