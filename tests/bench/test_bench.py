@@ -38,13 +38,13 @@ def test_rendering_benchmark_spans_episodes(monkeypatch):
 
 
 def test_sharing_benchmark_compares_two_runs_with_one(monkeypatch):
-    speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "ACTIVE"): [125.0]}
+    speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "300000"): [125.0]}
 
-    def apart(function, seconds, count=1, OMP_WAIT_POLICY=""):
-        return [{"updates_per_s": speed} for speed in speeds[count, OMP_WAIT_POLICY]]
+    def apart(function, seconds, count=1, GOMP_SPINCOUNT=""):
+        return [{"updates_per_s": speed} for speed in speeds[count, GOMP_SPINCOUNT]]
 
     monkeypatch.setattr(processes, "apart", apart)
-    assert processes.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "passive_over_active": 0.8}
+    assert processes.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "over_spinning": 0.8}
 
 
 def test_training_benchmarks_use_the_selected_device(monkeypatch):

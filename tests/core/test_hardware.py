@@ -1,8 +1,11 @@
 """Devices, precision and frame buffers."""
 
+import os
+
 import pytest
 import torch
 
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.hardware import FrameBuffers, autocast, pick_device, set_products
 from vd4rl_pomdp.nn.heads import ExactLinear
@@ -25,6 +28,21 @@ def test_missing_device_is_rejected(name, message):
     assert pick_device("cpu") == CPU
     with pytest.raises(UserError, match=message):
         pick_device(name)
+
+
+@pytest.mark.parametrize(
+    ("running", "threads", "cores", "warns"), [(2, 2, 2, True), (1, 2, 2, False), (2, 1, 2, False), (13, 4, 16, False)]
+)
+def test_training_warns_if_busy_cores_would_slow_its_threads_down(
+    tmp_path, monkeypatch, capsys, running, threads, cores, warns
+):
+    load = tmp_path / "loadavg"
+    load.write_text(f"0.5 0.6 0.7 {running}/412 999\n")
+    monkeypatch.setattr(hardware, "_RUNNING", load)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(cores))
+    hardware.warn_of_busy_cores(CPU)
+    assert ("other programs use 1 of 2 cores" in capsys.readouterr().err) == warns
 
 
 @pytest.mark.gpu

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -32,6 +35,32 @@ def pick_device(name: str) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise UserError(f"device {name!r} was requested, but no such GPU is visible: use --device cpu")
     return device
+
+
+_RUNNING = Path("/proc/loadavg")
+"""Linux: its fourth field is the number of threads that run now, and of all."""
+
+
+def warn_of_busy_cores(device: torch.device) -> None:
+    """Warn before training with several threads while other programs use half of the cores or more.
+
+    In backward convolutions, oneDNN's threads spin until all of them arrive, whatever OpenMP's wait policy: on two
+    cores, two pretrainings with two threads each took 47 times as long as one.
+    """
+    threads = torch.get_num_threads()
+    if device.type != "cpu" or threads == 1 or not _RUNNING.exists():
+        return
+    counts = []
+    for _ in range(5):  # the smallest of several, since programs wake for a moment
+        counts.append(int(_RUNNING.read_text(encoding="ascii").split()[3].partition("/")[0]) - 1)
+        time.sleep(0.01)
+    others, cores = min(counts), len(os.sched_getaffinity(0))
+    if others + threads > cores <= 2 * others:
+        print(
+            f"warning: other programs use {min(others, cores)} of {cores} cores, so {threads} threads that wait for "
+            "each other can be many times slower than one: interrupt, and resume with OMP_NUM_THREADS=1",
+            file=sys.stderr,
+        )
 
 
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
