@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# One would guess: with `OMP_WAIT_POLICY=PASSIVE` torch's waiting threads sleep, so two programs that share two cores each
-# get about half of the speed.
-# What happens: not where convolutions are differentiated. oneDNN's threads wait for each other by spinning there, outside
-# OpenMP. Two trainings of a small convolutional network with two threads each take many times as long as one of them;
-# with one thread each they hardly disturb each other.
+# One would guess: with `OMP_WAIT_POLICY=PASSIVE` torch's waiting threads sleep, so two programs that share two cores
+# each get about half of the speed.
+# What happens: not where convolutions are differentiated. There oneDNN's threads wait for each other by spinning,
+# outside OpenMP. Two trainings of a small convolutional network with two threads each take many times as long as one of
+# them; with one thread each they hardly disturb each other.
 # For this field: two seeds in two terminals of a laptop. One thread per training is the cure (`OMP_NUM_THREADS=1`).
 # (Linux, two cores or more; ratios vary by machine.)
 set -eu

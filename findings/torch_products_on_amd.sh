@@ -4,8 +4,8 @@
 # What happens, on AMD processors with AVX-512: by default MKL computes them, at half of what the processor can do.
 # "medium" permits bfloat16 and thereby selects oneDNN, which finds no use for bfloat16 here and rounds nothing: about
 # twice as fast, at the accuracy of float32.
-# For this field: many cloud machines have such processors, and a comparison of PyTorch with JAX in float32 on them mostly
-# measures MKL. On other processors "medium" may round.
+# For this field: many cloud machines have such processors. A float32 comparison of PyTorch with JAX there mostly measures
+# MKL. On other processors "medium" may round.
 set -eu
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT
