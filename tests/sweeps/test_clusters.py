@@ -70,14 +70,14 @@ def test_slurm_sweep_finishes_after_a_stop_and_a_cancelled_task(tmp_path, monkey
 def fakes(tmp_path, monkeypatch):
     """Slurm's commands as scripts that log their calls."""
 
-    def write(**scripts: str) -> SlurmCluster:
+    def write(stack: int = 1, **scripts: str) -> SlurmCluster:
         for name, text in (FAKES | scripts).items():
             script = tmp_path / "bin" / name
             script.parent.mkdir(exist_ok=True)
             script.write_text(f"#!/bin/sh\necho {name} $* >> {tmp_path}/called\n{text}\n")
             script.chmod(0o755)
         monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
-        return SlurmCluster(SlurmOptions(stack=5), SweepFolder(tmp_path), "a plan")
+        return SlurmCluster(SlurmOptions(stack=stack), SweepFolder(tmp_path), "a plan")
 
     return write
 
@@ -91,7 +91,7 @@ def test_slurm_errors_timeouts_and_stop(fakes, tmp_path, monkeypatch, capsys):
     assert cluster.live() == 2
     called = next(line for line in (tmp_path / "called").read_text().splitlines() if "--array=0-2" in line)
     assert f"--job-name={cluster._name} " in called
-    assert f"sweep join {tmp_path} --jobs 1 --jobs-per-gpu 1 --stack 5 --plan 'a plan'" in called
+    assert f"sweep join {tmp_path} --jobs 1 --jobs-per-gpu 1 --stack 1 --plan 'a plan'" in called
     fakes(squeue=":").stop()
     lines = [line.split()[-1] for line in (tmp_path / "called").read_text().splitlines() if line.startswith("scancel")]
     assert lines == ["--state=PENDING", "--signal=USR2", "--quiet"]
@@ -130,7 +130,7 @@ class IdleCluster:
 
     folder, tasks = Path("tasks"), 2
 
-    def __init__(self, stack):
+    def __init__(self, stack=1):
         self.local = LocalOptions(jobs=1, stack=stack)
         self.asked, self.answers, self.stopped = [], iter([None, UnavailableError("it does not answer")]), False
 
@@ -146,15 +146,23 @@ class IdleCluster:
         self.stopped = True
 
 
-@pytest.mark.parametrize(("make", "stack", "tasks"), [(job, 1, 2), (policy, 3, 1)])
-def test_idle_cluster_ends_sweep_and_unavailable_one_is_retried(tmp_path, monkeypatch, capsys, make, stack, tasks):
+def test_idle_cluster_ends_sweep_and_unavailable_one_is_retried(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(clusters, "LOOK_S", 0.0)
-    plan, cluster = keep_plan(tmp_path, *(make(tmp_path, name) for name in "abc")), IdleCluster(stack)
+    plan, cluster = keep_plan(tmp_path, *(job(tmp_path, name) for name in "abc")), IdleCluster()
     with pytest.raises(UserError, match="tasks end before they start a job: see tasks"):
         watch([plan], cluster, SweepFolder(tmp_path))
-    assert cluster.asked == [tasks] * 3, "limited by the number of tasks, one per stack"
+    assert cluster.asked == [2] * 3, "limited by the number of tasks"
     assert cluster.stopped
     assert capsys.readouterr().err == "warning: it does not answer; trying again\n"
+
+
+def test_one_task_is_requested_per_stack(fakes, tmp_path, monkeypatch):
+    monkeypatch.setattr(clusters, "LOOK_S", 0.0)
+    plan, cluster = keep_plan(tmp_path, *(policy(tmp_path, name) for name in "abc")), IdleCluster(stack=3)
+    with pytest.raises(UserError, match="tasks end before they start a job"):
+        watch([plan], cluster, SweepFolder(tmp_path))
+    assert cluster.asked == [1] * 3
+    assert fakes(stack=5).local == LocalOptions(1, 1, stack=5)
 
 
 RAY = """
