@@ -2,7 +2,8 @@
 
 Each process uses one thread, since tests run in several processes on small tensors. JAX compiles without most
 optimisations, because tests compile much and run little. SIGINT gets its default handler, which background jobs of a
-shell ignore.
+shell ignore. Submitit is imported before any test captures stderr: its logging setup closes the stream of absl's
+handler unless that is stderr.
 
 GPUs are hidden unless `-m gpu` selects the tests that need one. Tracebacks of crashed processes are printed at the end.
 """
@@ -11,6 +12,7 @@ import faulthandler
 import os
 import shutil
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,9 @@ import sklearn.cluster  # noqa: F401  imported once, and not by a subprocess for
 import torch
 
 from tests.helpers_data import write_fake_set
+
+with suppress(ImportError):
+    import submitit  # noqa: F401
 
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 torch.set_num_threads(1)

@@ -63,7 +63,7 @@ if [ "$(version "$VENV/bin/python")" != "$(version "$PYTHON")" ]; then
 fi
 say "setup: installing Python packages (a few minutes the first time)"
 pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
-pip_install -e ".[dev,navigation,policy,tracking,ray]"
+pip_install -e ".[dev,navigation,policy,tracking,slurm,ray]"
 pip_install --no-deps dm-control # on Python 3.13 only this works; elsewhere it is installed already
 
 # Whether a task can be rendered here.

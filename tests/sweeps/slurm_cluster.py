@@ -6,6 +6,7 @@ import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 from tests.helpers_sweeps import until
@@ -42,6 +43,8 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=60 State=UP
 
 def why_not() -> str:
     """Why no cluster can be started here; empty if one can."""
+    if find_spec("submitit") is None:
+        return "no submitit: pip install '.[slurm]'"
     missing = [name for name in ("munged", "slurmctld", "slurmd", "sbatch") if shutil.which(name) is None]
     if missing:
         return f"no {missing[0]}: apt-get install --no-install-recommends slurmctld slurmd slurm-client munge"

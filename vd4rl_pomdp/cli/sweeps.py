@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import signal
 import sys
 from collections import Counter
 from collections.abc import Mapping
@@ -140,8 +139,8 @@ def carry_out(plans: list[folders.Plan], folder: folders.SweepFolder, kind: str,
     if kind == "local":
         finished = driver.Driver(plans, options, folder).run()
     else:
-        cluster = {"slurm": clusters.SlurmCluster, "ray": clusters.RayCluster}[kind](options, folder, name)
-        finished = clusters.watch(plans, cluster, folder)
+        cluster = {"slurm": clusters.SlurmCluster, "ray": clusters.RayCluster}[kind](options, folder.path / kind)
+        finished = clusters.watch(plans, cluster, folder, name)
     jobs = folders.jobs_of(plans)
     if not finished:
         found = folders.status(jobs, folder.attempts(jobs))
@@ -216,7 +215,6 @@ def join(
     """
     options = LocalOptions(jobs, jobs_per_gpu, threads, stack)
     options.check()
-    signal.signal(signal.SIGUSR2, lambda *_: signal.raise_signal(signal.SIGTERM))  # Slurm's warning
     folder = folders.SweepFolder(out)
     finished = driver.Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
     print("all jobs are finished" if finished else "no job can start now; `sweep status` shows what is left")

@@ -9,19 +9,20 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import shlex
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, first_line, flag_of
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, first_line
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.outputs import in_use
-from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, import_path, in_stacks, say
+from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, say
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
@@ -30,13 +31,38 @@ ANSWER_S = 30.0  # timeout of a command to the cluster, seconds
 VAIN = 3  # resubmissions without any progress before the sweep gives up
 
 
-def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFolder) -> bool:
+@dataclass(frozen=True)
+class ClusterTask:
+    """What runs on a node: a driver that helps with a sweep."""
+
+    out: Path
+    plan: str  # name of the plan; empty: all plans in the folder
+    options: LocalOptions
+    cwd: str  # working directory, to which relative paths refer
+
+    def __call__(self) -> None:
+        """Run unclaimed jobs until none is left. SIGTERM and SIGUSR2 (Slurm's warning) end it gracefully."""
+        try:
+            os.chdir(self.cwd)
+        except OSError as error:
+            raise UserError(
+                f"{self.cwd}: does not exist on node {socket.gethostname()}; use a disk that all nodes share"
+            ) from error
+        with interrupt.handled():
+            # submitit would resubmit the task on SIGUSR2; here `watch` decides that.
+            signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+            folder = SweepFolder(self.out)
+            Driver(folder.plans_to_do(self.plan), self.options, folder, helps=True).run()
+
+
+def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFolder, name: str) -> bool:
     """Keep a sweep's tasks on the cluster until no job can run any more. Return whether all jobs are finished.
 
-    The cluster's nodes see all folders at the same paths. UserError if the cluster rejects the first tasks, or tasks
-    keep ending without progress.
+    The cluster's nodes see all folders at the same paths. `name` is that of the plan; empty: all plans in the folder.
+    UserError if the cluster rejects the first tasks, or tasks keep ending without progress.
     """
     jobs = jobs_of(plans)
+    task = ClusterTask(folder.out, name, cluster.local, os.getcwd())
     said = {name: len(rows) for name, rows in folder.attempts(jobs).items()}
     vain, heard = 0, False
     try:
@@ -62,7 +88,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                     if vain > VAIN:
                         raise UserError(f"tasks end before they start a job: see {cluster.folder}")
                     with interrupt.deferred():  # an interrupted submission could not be cancelled
-                        cluster.submit(wanted)
+                        cluster.submit(task, wanted)
                 heard = True
             except UnavailableError as error:
                 if not heard:  # fail on the first contact; later, keep trying
@@ -78,41 +104,39 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
 
 
 class SlurmCluster:
-    """A sweep's tasks as Slurm job arrays of `vd4rl-pomdp sweep join`, under a job name hashed from the folder."""
+    """A sweep's tasks as Slurm job arrays, submitted by submitit under a job name hashed from the folder."""
 
-    def __init__(self, options: SlurmOptions, sweep: SweepFolder, plan: str = "") -> None:
-        """UserError if Slurm's commands are missing here. Slurm is not contacted yet.
+    def __init__(self, options: SlurmOptions, folder: Path) -> None:
+        """Check that submitit and Slurm's commands are installed, or raise UserError. Slurm is not contacted yet.
 
-        `plan` is the plan that tasks work on; empty: all plans in the folder.
+        Submitit and the tasks write into `folder`, on a disk shared by all nodes.
         """
+        try:
+            import submitit
+        except ImportError as error:
+            extra = "pip install '.[slurm]' in a clone of vd4rl-pomdp"
+            raise UserError(f"--executor slurm needs submitit: {extra}") from error
         for name in ("sbatch", "squeue", "scancel", "srun"):
             if shutil.which(name) is None:
                 raise UserError(f"--executor slurm finds no {name} here: start the sweep where Slurm's commands are")
-        self.folder, self.tasks = sweep.path / "slurm", options.tasks
+        self.folder, self.tasks = folder, options.tasks
         self.local = LocalOptions(options.jobs_per_task, options.jobs_per_task, stack=options.stack)
-        digest = hashlib.blake2b(str(self.folder.resolve()).encode(), digest_size=4).hexdigest()
+        digest = hashlib.blake2b(str(folder.resolve()).encode(), digest_size=4).hexdigest()
         self._name = f"vd4rl-pomdp-{digest}"
-        self._line = ["sbatch", f"--job-name={self._name}", f"--output={self.folder}/%A_%a.log", *parameters(options)]
-        join = [sys.executable, "-P", "-m", "vd4rl_pomdp", "sweep", "join", str(sweep.out.resolve())]
-        for flag in ("jobs", "jobs_per_gpu", "stack"):
-            join += [flag_of(flag), str(getattr(self.local, flag))]
-        join += ["--plan", plan] if plan else []
-        # A step, since Slurm signals no batch script; some versions do not pass on its cores.
-        self._line += ["--wrap", shlex.join(["srun", f"--cpus-per-task={options.cpus}", *join])]
+        self._executor = submitit.AutoExecutor(folder, cluster="slurm")
+        self._executor.update_parameters(name=self._name, stderr_to_stdout=True, **parameters(options))
 
     def live(self) -> int:
         """Number of this sweep's tasks in the queue or running; UnavailableError if Slurm does not answer."""
         return len(self._ask("squeue", "--array", "--noheader", "--format=%T").split())
 
-    def submit(self, number: int) -> None:
-        with disk_errors(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-        environment = os.environ | {"PYTHONPATH": import_path()}
-        line = [*self._line, f"--array=0-{number - 1}"]
-        answer = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
-        if answer.returncode:
-            reason = (answer.stderr.strip() or "it does not say why").splitlines()[-1]
-            raise UserError(f"Slurm rejected the job array ({reason})")
+    def submit(self, task: ClusterTask, number: int) -> None:
+        try:
+            with disk_errors(self.folder):
+                self._executor.submit_array([task] * number)
+        except RuntimeError as error:  # how submitit reports a failed command
+            reason = (str(error).strip() or "it does not say why").splitlines()[-1]
+            raise UserError(f"Slurm rejected the job array ({reason})") from error
 
     def stop(self) -> None:
         """Cancel pending tasks, signal the running ones to checkpoint and exit, and wait for them."""
@@ -139,14 +163,20 @@ class SlurmCluster:
         return answer.stdout
 
 
-def parameters(options: SlurmOptions) -> list[str]:
-    """Flags of sbatch for a task."""
-    flags = {name: getattr(options, name) for name in ("partition", "account", "qos", "constraint", "time")}
-    flags |= {"cpus-per-task": options.cpus, "gpus-per-node": options.gpus or None}
-    flags |= {"mem": None if options.memory is None else f"{options.memory * 1024:.0f}M"}
-    flags |= {"signal": f"USR2@{PATIENCE_S + 15:.0f}", "open-mode": "append"}
-    words = [f"--{name}={value}" for name, value in flags.items() if value is not None]
-    return [*words, "--requeue", *(f"--{word.removeprefix('--')}" for word in options.sbatch)]
+def parameters(options: SlurmOptions) -> dict[str, Any]:
+    """Task options as submitit's `slurm_*` parameters."""
+    further = [parameter.removeprefix("--").partition("=") for parameter in options.sbatch]
+    found = {
+        **{name: getattr(options, name) for name in ("partition", "account", "qos", "constraint", "time")},
+        "gpus_per_node": options.gpus or None,
+        "mem": None if options.memory is None else f"{options.memory * 1024:.0f}M",
+        "cpus_per_task": options.cpus,
+        "srun_args": [f"--cpus-per-task={options.cpus}"],  # some Slurm versions do not inherit it from sbatch
+        "array_parallelism": options.tasks,
+        "signal_delay_s": round(PATIENCE_S + 15),
+        "additional_parameters": {"requeue": True} | {name: value or True for name, _, value in further},
+    }
+    return {f"slurm_{name}": value for name, value in found.items() if value is not None}
 
 
 class RayCluster:
@@ -155,14 +185,13 @@ class RayCluster:
     Ray picks nodes and GPUs, and kills a task when the driver that submitted it dies. Ray's own retries are off.
     """
 
-    def __init__(self, options: RayOptions, sweep: SweepFolder, plan: str = "") -> None:
+    def __init__(self, options: RayOptions, folder: Path) -> None:
         """Connect to the cluster; UserError if Ray is missing, no cluster answers, or no node fits a job."""
         try:
             import ray
         except ImportError as error:
             raise UserError("--executor ray needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp") from error
-        self._ray, self._options, self.folder = ray, options, sweep.path
-        self._plan, self._out = plan, sweep.out.resolve()
+        self._ray, self._options, self.folder = ray, options, folder
         self.local = LocalOptions(jobs=1, threads=max(1, int(options.cpus)), stack=options.stack)
         self._running: list[Any] = []
         before = signal.getsignal(signal.SIGTERM)  # ray.init replaces this handler
@@ -206,16 +235,9 @@ class RayCluster:
                 print(f"warning: a task ended ({reason})", file=sys.stderr, flush=True)
         return len(self._running)
 
-    def submit(self, number: int) -> None:
-        out, plan, options = self._out, self._plan, self.local
-
-        def join() -> None:
-            folder = SweepFolder(out)
-            with interrupt.handled():
-                Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
-
-        run = self._ray.remote(max_retries=0)(join)  # retries are decided from the sweep's attempt log
-        run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(out))
+    def submit(self, task: ClusterTask, number: int) -> None:
+        run = self._ray.remote(max_retries=0)(lambda: task())  # retries are decided from the sweep's attempt log
+        run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
         self._running += [run.remote() for _ in range(number)]
 
     def stop(self) -> None:

@@ -47,6 +47,7 @@ IN_USE_S = 10.0  # seconds before checking again on a job that another driver is
 IDLE_S = 90.0  # seconds after which a helping driver with nothing to start exits
 PATIENCE_S = 120.0
 """Seconds between SIGTERM and SIGKILL, in which a job finishes its step and writes a checkpoint."""
+_ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
@@ -225,11 +226,6 @@ class Driver:
             say(row, len(self._jobs) - len(self._left), len(self._jobs))
 
 
-def import_path() -> str:
-    """PYTHONPATH of a process that imports this package from where this one did."""
-    return os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
-
-
 def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:
     """Start the process `vd4rl-pomdp WORDS` in the plan's working directory, its output appended to `log`.
 
@@ -237,7 +233,8 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
     """
     # One command line per process: anyone can repeat it by hand, a crash or OOM kill takes down nothing else, and the
     # system manages cores, GPU and signals. The exit code is all that the driver learns.
-    own = {JOB_VARIABLE: "1", "PYTHONPATH": import_path()}
+    imports = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    own = {JOB_VARIABLE: "1", "PYTHONPATH": imports}
     if threads or not os.environ.get("OMP_NUM_THREADS"):
         own["OMP_NUM_THREADS"] = str(threads or max(1, len(place.cores)))
     own |= {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
