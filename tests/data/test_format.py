@@ -212,3 +212,24 @@ def test_attributes_other_than_json_object_are_rejected(shard, stored):
         file.attrs["vd4rl_pomdp"] = stored
     with pytest.raises(UserError, match=r"0_fake\.hdf5: "):
         read_attributes(shard)
+
+
+@pytest.mark.parametrize("kind", ["link", "storage", "virtual"])
+def test_arrays_in_other_files_are_rejected(shard, tmp_path, kind):
+    with h5py.File(shard, "a") as file, h5py.File(tmp_path / "other.h5", "w") as other:
+        value = file.pop("reward")[()]
+        other["reward"] = value
+        if kind == "link":
+            file["reward"] = h5py.ExternalLink(other.filename, "reward")
+        elif kind == "storage":
+            value.tofile(tmp_path / "other.bin")
+            file.create_dataset(
+                "reward", value.shape, value.dtype, external=[(tmp_path / "other.bin", 0, value.nbytes)]
+            )
+        else:
+            layout = h5py.VirtualLayout(value.shape, value.dtype)
+            layout[...] = h5py.VirtualSource(other["reward"])
+            file.create_virtual_dataset("reward", layout)
+    for read in (read_shard, read_dtypes):
+        with pytest.raises(UserError, match="'reward' is stored in another file"):
+            read(shard)

@@ -173,10 +173,13 @@ def _open(path: Path) -> Iterator[h5py.File]:
 
 
 def _keys(path: Path, file: h5py.File) -> list[str]:
-    """Keys of the format that are in a file; UserError if one is missing or no array."""
+    """Keys of the format that are in a file; UserError if one is missing, no array, or kept in another file."""
     keys = [key for key in (FRAMES_KEY, *_ROW_KEYS) if key != "physics" or key in file]
     for key in keys:
         # not `file.get`, which hides a failing disk; HDF5's null datasets have no shape
         if key not in file or not isinstance(stored := file[key], h5py.Dataset) or stored.shape is None:
             raise UserError(f"{path}: has no {key!r}, so it is not a V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
+        linked = isinstance(file.get(key, getlink=True), h5py.ExternalLink)
+        if linked or stored.external or stored.is_virtual:  # a shard from elsewhere must not read other files here
+            raise UserError(f"{path}: {key!r} is stored in another file, which is not supported; {_REPAIR}")
     return keys
