@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
-from PIL import Image, ImageDraw
+from matplotlib.patches import Circle, Rectangle
 
 from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
 from vd4rl_pomdp.studies.navigation.runs import (
@@ -27,7 +28,7 @@ from vd4rl_pomdp.studies.navigation.runs import (
     read_trajectory,
 )
 
-_ESTIMATE = "#d55e00"
+_TRUE, _ESTIMATE = "#009e73", "#d55e00"
 _VARIANTS = {
     "K = 1": (1, False, "#9ecae1"),
     "K = 15": (15, False, "#0072b2"),
@@ -40,15 +41,6 @@ _OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
 _SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
 _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
 _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
-SIDE, HEAD = 240, 22
-"""Sizes of a video panel in pixels: the maze's side, and the height of the line above it."""
-_FINE = 2
-_SHOWN = 1.75
-"""Half width of the visible part of the maze: the free cells and some of the walls."""
-_MILLISECONDS = 80
-"""Milliseconds per video frame: slightly slower than real time."""
-_WALL, _FLOOR, _PAPER, _INK = (228, 201, 168), (58, 82, 110), (255, 255, 255), (30, 30, 30)
-_CURTAIN, _TRUE, _RING = (200, 140, 85, 165), (90, 200, 90), (255, 90, 0)
 
 
 def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> bool:
@@ -115,13 +107,7 @@ def trajectories(runs: list[NavigationRun], path: Path) -> bool:
             if (condition := Condition(maze, method)) not in found:
                 axes.text(0.5, 0.5, f"{maze}: {method}\nno run", ha="center", va="center", transform=axes.transAxes)
                 continue
-            axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), 2 * HALF_SIZE, 2 * HALF_SIZE, color="#e4c9a8", zorder=0))
-            for i, j in FREE_CELLS:
-                axes.add_patch(Rectangle((j - HALF_SIZE, HALF_SIZE - i - 1), 1, 1, color="#f7f7f7", zorder=0))
-            for (x, y), (half_x, half_y) in ((curtain.center, curtain.half) for curtain in MAZES[maze].curtains):
-                corner, size = (x - half_x, y - half_y), (2 * half_x, 2 * half_y)
-                axes.add_patch(Rectangle(corner, *size, color="#5b5b78", alpha=0.25, zorder=1))
-            axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
+            _draw_maze(axes, MAZES[maze])
             table = read_trajectory(found[condition])
             for before, colour, label in (("", "black", "true"), ("estimated_", _ESTIMATE, "probe")):
                 points = [table[f"{before}{name}"][:_DRIVEN_ROWS] for name in "xy"]
@@ -147,43 +133,37 @@ def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
 
 
 def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> None:
-    """Write an animated GIF with one panel per name.
+    """Write an animated GIF, slightly slower than real time, with one panel per name.
 
     The true mass is a green disc, visible through the curtains here; the estimate is an orange ring. `trajectories`
     are the trajectory.csv of runs on that maze.
     """
     tables = {name: read_trajectory(file) for name, file in trajectories.items()}
-    ground = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)
-    draw = ImageDraw.Draw(ground)
-    draw.rectangle([0, HEAD * _FINE, SIDE * _FINE, (SIDE + HEAD) * _FINE], fill=_WALL)
-    for row, column in FREE_CELLS:
-        left, top = column - HALF_SIZE, HALF_SIZE - row
-        draw.rectangle(_box(left, top, left + 1, top - 1), fill=_FLOOR)
-    frames = []
-    for row in range(min(len(table["x"]) for table in tables.values())):
-        panels = []
-        for name, table in tables.items():
-            image = ground.copy()
-            draw = ImageDraw.Draw(image, "RGBA")
-            x, y = table["x"][row], table["y"][row]
-            draw.ellipse(_box(x - BALL_RADIUS, y + BALL_RADIUS, x + BALL_RADIUS, y - BALL_RADIUS), fill=_TRUE)
-            for (x, y), (half_x, half_y) in ((curtain.center, curtain.half) for curtain in maze.curtains):
-                draw.rectangle(_box(x - half_x, y + half_y, x + half_x, y - half_y), fill=_CURTAIN)
-            x, y = table["estimated_x"][row], table["estimated_y"][row]
-            box = _box(x - BALL_RADIUS, y + BALL_RADIUS, x + BALL_RADIUS, y - BALL_RADIUS)
-            draw.ellipse(box, outline=_RING, width=3 * _FINE)
-            small = image.resize((SIDE, SIDE + HEAD), Image.Resampling.LANCZOS)
-            ImageDraw.Draw(small).text((6, 5), f"{name}: mass and estimate", fill=_INK)
-            panels.append(np.asarray(small))
-        frames.append(Image.fromarray(np.concatenate(panels, axis=1)))
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=_MILLISECONDS, loop=0)
+    figure = Figure(figsize=(2.4 * len(tables), 2.6))
+    figure.subplots_adjust(left=0, right=1, bottom=0, top=2.4 / 2.6, wspace=0)
+    discs = []
+    for axes, name in zip(figure.subplots(1, len(tables), squeeze=False).flat, tables, strict=True):
+        _draw_maze(axes, maze)
+        axes.set_axis_off()
+        axes.set_title(f"{name}: mass and estimate", fontsize=9, pad=2)
+        mass = Circle((0, 0), BALL_RADIUS, color=_TRUE, zorder=2)
+        estimate = Circle((0, 0), BALL_RADIUS, fill=False, edgecolor=_ESTIMATE, linewidth=2, zorder=3)
+        discs.append((axes.add_patch(mass), axes.add_patch(estimate)))
+    writer = PillowWriter(fps=12)
+    with writer.saving(figure, str(path), dpi=100):
+        for row in range(min(map(len, tables.values()))):
+            for (mass, estimate), table in zip(discs, tables.values(), strict=True):
+                mass.center = table["x"][row], table["y"][row]
+                estimate.center = table["estimated_x"][row], table["estimated_y"][row]
+            writer.grab_frame()
 
 
-def to_pixels(x: float, y: float) -> tuple[float, float]:
-    """Column and row in a panel of a position in the maze."""
-    return (x + _SHOWN) / (2 * _SHOWN) * SIDE, HEAD + (_SHOWN - y) / (2 * _SHOWN) * SIDE
-
-
-def _box(left: float, top: float, right: float, bottom: float) -> list[float]:
-    """Corners of a rectangle in the maze, in the fine pixels of a panel that is being drawn."""
-    return [_FINE * number for number in (*to_pixels(left, top), *to_pixels(right, bottom))]
+def _draw_maze(axes: Axes, maze: MazeSpec) -> None:
+    """Walls, free cells and translucent curtains of a maze from above."""
+    axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), 2 * HALF_SIZE, 2 * HALF_SIZE, color="#e4c9a8", zorder=0))
+    for i, j in FREE_CELLS:
+        axes.add_patch(Rectangle((j - HALF_SIZE, HALF_SIZE - i - 1), 1, 1, color="#f7f7f7", zorder=0))
+    for (x, y), (half_x, half_y) in ((curtain.center, curtain.half) for curtain in maze.curtains):
+        corner, size = (x - half_x, y - half_y), (2 * half_x, 2 * half_y)
+        axes.add_patch(Rectangle(corner, *size, color="#5b5b78", alpha=0.25, zorder=1))
+    axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
