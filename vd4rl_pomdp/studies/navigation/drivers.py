@@ -197,20 +197,12 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
         raise UserError(f"{config.out}: exists already; remove it, or choose another --out")
     try:
         from stable_baselines3 import PPO
-        from stable_baselines3.common.callbacks import BaseCallback
         from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.vec_env import DummyVecEnv
     except ImportError as error:
         raise UserError(
             f"training a policy needs stable-baselines3 ({error}): `pip install '.[policy]'` in the package's folder"
         ) from None
-
-    class Report(BaseCallback):
-        """Updates the progress line."""
-
-        def _on_step(self) -> bool:
-            progress.advance(_PARALLEL)
-            return True
 
     environments = DummyVecEnv([lambda: FirstPersonEnv(config.maze, config.action_repeat) for _ in range(_PARALLEL)])
     model = PPO(
@@ -226,7 +218,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     )
     model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
-        model.learn(config.decisions, callback=Report())
+        model.learn(config.decisions, callback=lambda *_: progress.advance(_PARALLEL) is None)  # false would stop it
     policy: Any = model.policy
     layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
     weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}

@@ -84,15 +84,10 @@ def load_pool(source: str, seed: int) -> Tensor:
             f"or JPEG files, or use --exogenous {TEXTURES}"
         )
     batches = {path: _read_cifar(path) for path in files if _is_cifar(path)}
-    ends = np.cumsum([len(batches[path]) if path in batches else 1 for path in files])
-    drawn = rng.permutation(ends[-1])[:POOL]
-    number = np.searchsorted(ends, drawn, side="right")
-    pool = torch.empty((len(drawn), 3, PICTURE_SIZE, PICTURE_SIZE), dtype=torch.uint8)
-    for file in np.unique(number):
-        mine = np.flatnonzero(number == file)
-        images = batches[files[file]] if files[file] in batches else _read_image(files[file])
-        pool[mine] = _to_size(images[drawn[mine] - ends[file]])  # a negative index, counted from the file's end
-    return pool
+    images = [(path, number) for path in files for number in range(len(batches[path]) if path in batches else 1)]
+    drawn = [images[i] for i in rng.permutation(len(images))[:POOL]]
+    pictures = (batches[path][number] if path in batches else _read_image(path) for path, number in drawn)
+    return torch.cat([_to_size(picture[None]) for picture in pictures])
 
 
 def _textures(rng: np.random.Generator) -> Tensor:
@@ -147,10 +142,10 @@ def _is_cifar(path: Path) -> bool:
 
 
 def _read_image(path: Path) -> np.ndarray:
-    """(1, H, W, 3) uint8 of one PNG or JPEG file."""
+    """(H, W, 3) uint8 of one PNG or JPEG file."""
     content = read_bytes(path)
     try:
-        return np.asarray(rgb_of(Image.open(io.BytesIO(content))))[None]
+        return np.asarray(rgb_of(Image.open(io.BytesIO(content))))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # raised by Pillow
         raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
 
