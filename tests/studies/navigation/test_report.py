@@ -68,7 +68,7 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
     header = "t,x,y,vx,vy,estimated_x,estimated_y,estimated_vx,estimated_vy,hidden\n"
     for name, value in (
         ("config.json", record),
-        ("results.json", {"maze": condition.maze, "set": "f00", "command": command, "rows": rows}),
+        ("results.json", {"maze": condition.maze, "set": "f00", "rows": rows}),
         ("timing.json", {"steps": 2500, "seconds": 300.0}),
         ("machine.json", {"processor": "some", "cores": 2, "gpu": None}),
     ):
@@ -240,7 +240,7 @@ def test_first_person_claims_are_judged(tmp_path):
     judged = [
         claim for claim in claims("compass_first_person") if "state error" in claim.text and "K=1" not in claim.text
     ]
-    assert {claim.text: judge(claim, found).holds for claim in judged} == {
+    assert {claim.text: judge(claim, found)[0] for claim in judged} == {
         "state error of mik+a, of the untrained one's": False,
         "state error of mik+a": False,
         "no_history's state error, of that of mik+a": True,

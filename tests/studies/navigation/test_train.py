@@ -7,14 +7,13 @@ import torch
 
 from pretrain.objectives import METHODS, Method
 from pretrain.train import Trainer
-from tests.helpers_data import fake_rows, write_fake_set
-from vd4rl_pomdp.cli.parsing import parse_stage
+from tests.helpers_data import fake_rows
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
 from vd4rl_pomdp.nn.objective import ActionOptions, InverseOptions, StateInverse
-from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.runs import METHOD_NAMES, OBJECTIVES
 from vd4rl_pomdp.studies.navigation.train import (
     ErrorSums,
@@ -232,27 +231,24 @@ def test_invalid_navigation_settings_are_rejected(maze_set, tmp_path, changes, m
     assert not (tmp_path / "run").exists()
 
 
-def test_unsuitable_datasets_are_rejected(tmp_path):
-    other = write_fake_set(tmp_path / "walker_walk" / "expert")
-    with pytest.raises(UserError, match="names no maze"):
-        train(smoke(other, tmp_path / "run"))
-    shrunk = write_fake_set(tmp_path / "shrunk", attributes={"task": "no_curtain"})
-    with pytest.raises(UserError, match="has frames of 84 pixels, mazes of 100"):
-        train(smoke(shrunk, tmp_path / "run"))
-    short = fake_rows([1, 20, 20], action_dim=2, physics_dim=4) | {"observation": np.zeros((41, 3, 100, 100), np.uint8)}
-    (tmp_path / "short").mkdir()
-    write_shard(tmp_path / "short" / "0.hdf5", short, {"task": "no_curtain"})
-    with pytest.raises(UserError, match="trajectory 0 is a single row, without a step; remove it, or"):
-        train(smoke(tmp_path / "short", tmp_path / "run"))
-    rows = fake_rows([20, 20], action_dim=2) | {"observation": np.zeros((40, 3, 100, 100), np.uint8)}
-    for name, attributes, message in (
-        ("none", {}, "names no maze"),
-        ("stateless", {"task": "no_curtain"}, "holds no true states"),
-    ):
-        (tmp_path / name).mkdir()
-        write_shard(tmp_path / name / "0.hdf5", rows, attributes)
-        with pytest.raises(UserError, match=message):
-            train(smoke(tmp_path / name, tmp_path / "run"))
+@pytest.mark.parametrize(
+    ("attributes", "lengths", "size", "physics_dim", "message"),
+    [
+        ({}, [20, 20], 100, 4, "names no maze"),
+        ({"task": "walker_walk"}, [20, 20], 100, 4, "names no maze"),
+        ({"task": "no_curtain"}, [20, 20], 84, 4, "has frames of 84 pixels, mazes of 100"),
+        ({"task": "no_curtain"}, [20, 20], 100, 0, "holds no true states"),
+        ({"task": "no_curtain"}, [40], 100, 4, "a single trajectory leaves none to hold out"),
+        ({"task": "no_curtain"}, [1, 20, 20], 100, 4, "trajectory 0 is a single row, without a step; remove it, or"),
+    ],
+)
+def test_unsuitable_datasets_are_rejected(tmp_path, attributes, lengths, size, physics_dim, message):
+    rows = fake_rows(lengths, action_dim=2, physics_dim=physics_dim)
+    rows["observation"] = np.zeros((sum(lengths), 3, size, size), np.uint8)
+    (tmp_path / "set").mkdir()
+    write_shard(tmp_path / "set" / "0.hdf5", rows, attributes)
+    with pytest.raises(UserError, match=message):
+        train(smoke(tmp_path / "set", tmp_path / "run"))
 
 
 def test_mixer_and_paper_preset_match_the_paper():
@@ -266,17 +262,6 @@ def test_mixer_and_paper_preset_match_the_paper():
     assert (paper.steps, paper.average_last, paper.learning_rate) == (200_000, 10_000, 1e-4)
     assert paper.options.target.codes == 20
     assert paper.frame_encoder == "mixer"
-
-
-def test_recorded_command_reproduces_the_config(maze_set, tmp_path):
-    for config in (
-        smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),
-        NavigationConfig.of("cpu", data=maze_set, out=tmp_path, literal_future=True, seed=4, max_k=1),
-        NavigationConfig.of("paper", data=maze_set, out=tmp_path),
-    ):
-        words = command_of(config)
-        assert words[:3] == ["vd4rl-pomdp", "navigation", "train"]
-        assert parse_stage(NavigationConfig, words[3:], "x") == config
 
 
 @pytest.fixture

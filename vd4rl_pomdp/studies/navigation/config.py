@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 from pretrain.config import TrainingConfig, frame_options, memory_options
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import UserError, refuse_outside, refuse_unknown
-from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, flat, words_of
+from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, flat
 from vd4rl_pomdp.nn.objective import ActionOptions
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES, Picture
 from vd4rl_pomdp.studies.navigation.runs import METHOD_NAMES, REFERENCES
@@ -151,12 +151,3 @@ class NavigationConfig(TrainingConfig):
         refuse_unknown("picture", self.picture, SHAPES)
         if self.burn_in >= self.window:
             raise UserError(f"--burn-in {self.burn_in} leaves no row of a window of {self.window}: lower it")
-
-
-def command_of(config: NavigationConfig) -> list[str]:
-    """The command that trains with a config: the preset, and every flag that differs from it."""
-    chosen = {name: getattr(config, name) for name in ("method", "frame_encoder", "exogenous")}
-    usual = flat(config.of(config.preset, **chosen)) | config.defaults(config.preset)
-    untold = ("preset", "device", "wandb", "tensorboard")
-    changed = {name: value for name, value in flat(config).items() if name not in untold and value != usual.get(name)}
-    return ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset, *words_of(changed)]

@@ -204,19 +204,11 @@ class Claim(NamedTuple):
         """Two numbers as a table shows them; the second one only where there is a right side."""
         return f"{left:.1f} / {right:.1f}" if self.right else f"{left:.1f}"
 
-
-class Verdict(NamedTuple):
-    """A claim with the runs' numbers."""
-
-    seeds: int
-    """Seeds that have both numbers."""
-    seeds_holding: int
-    holds: bool
-    """Whether the claim holds for the means over seeds."""
-    cells: list[str]
-    """Both means, and whether it holds for them, as a table shows them; dashes without seeds."""
-    paper: tuple[float, float] | None
-    """The paper's two numbers, if it has both and the claim is in its units."""
+    def by_seed(self, numbers: Numbers) -> list[tuple[float, float]]:
+        """Both sides' numbers for every seed that has both."""
+        left = numbers.get(self.left, {})
+        right = numbers.get(self.right, {}) if self.right else dict.fromkeys(left, 1.0)
+        return [(left[seed], right[seed]) for seed in sorted(left.keys() & right.keys())]
 
 
 def claims(maze: str) -> list[Claim]:
@@ -263,47 +255,41 @@ def claims(maze: str) -> list[Claim]:
     return found
 
 
-def judge(claim: Claim, numbers: Numbers) -> Verdict:
-    """Evaluate a claim over the seeds that both sides have."""
-    left = numbers.get(claim.left, {})
-    right = numbers.get(claim.right, {}) if claim.right else dict.fromkeys(left, 1.0)
-    seeds = sorted(left.keys() & right.keys())
-    holds, cells = False, ["-", "-"]
-    if seeds:
-        means = [sum(side[seed] for seed in seeds) / len(seeds) for side in (left, right)]
-        holds = claim.holds(*means)
-        cells = [claim.words(*means), "**yes**" if holds else "**no**"]
-    paper = paper_number(*claim.left), paper_number(*claim.right) if claim.right else 1.0
-    known = None if paper[0] is None or paper[1] is None else (paper[0], paper[1])
-    return Verdict(len(seeds), sum(claim.holds(left[seed], right[seed]) for seed in seeds), holds, cells, known)
+def judge(claim: Claim, numbers: Numbers) -> tuple[bool | None, list[str]]:
+    """Whether a claim holds for the means over seeds, None without any, and the cells of a table that show it."""
+    if not (seeds := claim.by_seed(numbers)):
+        return None, ["-", "-"]
+    means = [sum(side) / len(side) for side in zip(*seeds, strict=True)]
+    holds = claim.holds(*means)
+    return holds, [claim.words(*means), "**yes**" if holds else "**no**"]
 
 
 def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
     """A report section: the claims about all mazes with runs, whether they hold, and the paper's numbers."""
     numbers, trained = numbers_of(runs), {run.condition.maze for run in runs}
-    found = [
-        (maze, claim, judge(claim, numbers), judge(claim.raw(), numbers))
-        for maze in MAZES
-        if maze in trained
-        for claim in claims(maze)
-    ]
-    rows = []
-    for maze, claim, percent, raw in found:
+    found = [(maze, claim) for maze in MAZES if maze in trained for claim in claims(maze)]
+    rows, judged, printed, both, other = [], list[bool](), list[bool](), 0, list[str]()
+    for maze, claim in found:
+        raw = claim.raw()
+        (holds, cells), (raw_holds, raw_cells) = judge(claim, numbers), judge(raw, numbers)
         columns = [maze, f"{claim.text} {claim.relation} {claim.factor:g}{' x' if claim.right else ''}"]
-        if percent.seeds:
-            columns += [*percent.cells, f"{percent.seeds_holding} of {percent.seeds}"]
-        else:
+        if holds is None:
             columns += ["no run yet", "-", "-"]
-        columns += ["no error", "-"] if claim.raw() == claim else raw.cells
-        if raw.paper:
-            columns.append(f"{claim.words(*raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}")
         else:
+            judged.append(holds)
+            seeds = [claim.holds(*pair) for pair in claim.by_seed(numbers)]
+            columns += [*cells, f"{sum(seeds)} of {len(seeds)}"]
+        columns += ["no error", "-"] if raw == claim else raw_cells
+        if raw != claim and raw_holds is not None:
+            both += 1
+            other += [f"{maze}: {claim.text}"] * (holds != raw_holds)
+        left, right = paper_number(*raw.left), paper_number(*raw.right) if raw.right else 1.0
+        if left is None or right is None:
             columns.append("none")
+        else:
+            columns.append(f"{claim.words(left, right)}: {'yes' if claim.holds(left, right) else 'no'}")
+            printed += [] if raw_holds is None else [raw_holds]
         rows.append(columns)
-    judged = [percent.holds for _, _, percent, _ in found if percent.seeds]
-    printed = [raw.holds for *_, raw in found if raw.seeds and raw.paper]
-    both = [row for row in found if row[-1].seeds and row[1].raw() != row[1]]
-    other = [f"{maze}: {claim.text}" for maze, claim, percent, raw in both if percent.holds != raw.holds]
     changes = f"{len(other)} change ({'; '.join(other)})" if other else "none changes"
     of_ah = {maze: paper_number(Condition(maze, "ah+a"), online_error("position").raw()) for maze in MAZES}
     recorder = ", ".join(f"{number:.1f} ({maze})" for maze, number in of_ah.items() if number is not None)
@@ -312,7 +298,7 @@ def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
         "## Which statements hold",
         "",
         f"{sum(judged)} of {len(judged)} hold, {len(found) - len(judged)} have no runs yet. "
-        f"Of {len(both)} that are judged in both units, {changes}.",
+        f"Of {both} that are judged in both units, {changes}.",
         "Wording and bounds are this package's. "
         f"Of those for which the paper prints numbers, {sum(printed)} of {len(printed)} hold.",
         "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds`: how many it holds for.",
@@ -385,9 +371,11 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
         for name in filter(written.get, written):
             lines += [f"![{_CAPTIONS[name][0]}](figures/{name})", "", _CAPTIONS[name][1], ""]
         lines += [*table_sections(cells), _COMMANDS]
-        commands = [(run, run.result.files["results"]["command"], run.result.files["timing"]) for run in runs]
-        shell = [f"{words}  # {run.condition.maze}, {float(cost['seconds']):.0f} s" for run, words, cost in commands]
-        lines += code_block(shell, "bash")
+        commands = []
+        for run in runs:
+            seconds = float(run.result.files["timing"]["seconds"])
+            commands.append(f"{run.result.record['command']}  # {run.condition.maze}, {seconds:.0f} s")
+        lines += code_block(commands, "bash")
         write_text(out / "report.md", "\n".join(lines) + "\n")
     return out / "report.md"
 

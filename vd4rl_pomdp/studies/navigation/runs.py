@@ -238,7 +238,7 @@ def _read_run(result: Result) -> NavigationRun:
         left_out = {"method", "max_k", "literal_future", "preset", "steps" * (condition.method == UNTRAINED)}
         settings = {name: str(value) for name, value in settings.items() if name not in left_out}
         run = NavigationRun(result, condition, config["preset"], config["seed"], settings, values)
-        _ = float(timing["seconds"]), results["command"]  # for the report
+        _ = float(timing["seconds"]), result.record["command"]  # for the report
     for measure, value in values.items():
         if not math.isfinite(value):
             what = f"a {measure.measure} is {value}: the run has diverged"

@@ -11,7 +11,6 @@ deviation, where predicting the mean gives about 65 to 100, and the simulator's 
 from __future__ import annotations
 
 import math
-import shlex
 from collections import defaultdict
 from functools import partial
 from pathlib import Path
@@ -41,7 +40,7 @@ from vd4rl_pomdp.runs.files import replacing_file, write_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions, command_of
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, source_fingerprint, to_grey50, to_rgb50
 from vd4rl_pomdp.studies.navigation.runs import RAW_PREFIX, SUPERVISED, UNTRAINED, Measure
 
@@ -323,9 +322,8 @@ def train(config: NavigationConfig) -> RunFolder:
                 settings=settings_of(run.config),
             )
             save_encoder(run.path / "encoder", probed.encoder, card, frames)
-            record: dict[str, Any] = {"maze": data.maze.name, "set": data.dataset.fingerprint}
-            record |= {"command": shlex.join(command_of(config)), "rows": rows}
-            write_json(run.path / NAVIGATION_FILE, record)
+            found = {"maze": data.maze.name, "set": data.dataset.fingerprint, "rows": rows}
+            write_json(run.path / NAVIGATION_FILE, found)
             seconds = {"seconds": round(trained, 2), "total_seconds": round(run.seconds, 2)}
             run.finish(steps=trainer.step, frames=frames, **seconds)
     return run
