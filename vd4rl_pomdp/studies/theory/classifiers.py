@@ -6,12 +6,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
-from vd4rl_pomdp.studies.theory.law import Variable, in_order, joint_law
+from vd4rl_pomdp.studies.theory.law import Variable, joint_law
 from vd4rl_pomdp.studies.theory.world import Action, AgentState, World
 
 
@@ -94,8 +93,6 @@ class Comparison:
     """Whether it equals P(a_t | s_t, s_{t+1}) on every sequence."""
     certain: bool
     """Whether it always assigns probability 1 to the action taken."""
-    uniform: bool
-    """Whether it is always uniform over actions."""
     sees_action: bool
     """Whether a_t is among the objective's inputs."""
     decodes_past: bool
@@ -117,9 +114,6 @@ def first_row(view: ObjectiveView, memory: MemoryLengths) -> int:
 class Clash:
     """A sequence and an action on which an objective's classifier differs from the multi-step inverse."""
 
-    k: int
-    seen: dict[str, Hashable]
-    """The objective's inputs by name: "o_t", "a_t-1", "o_t+2" and so on."""
     states: tuple[AgentState, AgentState]
     """s_t and s_{t+k}."""
     action: Action
@@ -142,12 +136,8 @@ def clash(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> C
     place = gaps[row].index(max(gaps[row]))
     if not gaps[row][place]:
         return None
-    (values,), (states,) = law.values(visible, [row]), law.values(ends, [row])
-    seen = {
-        f"{kind}_t{j - t:+d}".removesuffix("+0"): value
-        for (kind, j), value in zip(in_order(visible), values, strict=True)
-    }
-    return Clash(k, seen, states, world.actions[place], exact[row][place], multi[row][place])
+    (states,) = law.values(ends, [row])
+    return Clash(states, world.actions[place], exact[row][place], multi[row][place])
 
 
 def compare(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> Comparison:
@@ -163,7 +153,6 @@ def compare(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) ->
         multi_step=seen.agrees(multi),
         one_step=seen.agrees(law.given([("s", t), ("s", t + 1)], ("a", t))),
         certain=seen.certain(),
-        uniform=seen.uniform(),
         sees_action=("a", t) in start | end,
         decodes_past=law.tells(start, [("s", t)]),
         decodes_end=law.tells(end, [("s", t + k)]),

@@ -100,10 +100,6 @@ class Conditional:
         """Whether every view determines the action."""
         return all(max(p) == 1 for p in self.kinds[1])
 
-    def uniform(self) -> bool:
-        """Whether all actions are equally likely under every view."""
-        return all(len(set(p)) == 1 for p in self.kinds[1])
-
     def entropy(self) -> float:
         """H(a | view) in nats; the only rounded number here."""
         kinds, distinct = self.kinds

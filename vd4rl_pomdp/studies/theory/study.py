@@ -77,13 +77,9 @@ def enumerated(world: World) -> dict[str, Any]:
         "examples": sum(row["examples"] for row in rows),
         "uniform_k": [row["k"] for row in rows if row["uniform"] == row["pairs"]],
         "informative_k": [row["k"] for row in rows if row["uniform"] < row["pairs"]],
-        "certain_k": [row["k"] for row in rows if row["certain"] == row["pairs"]],
         "diameter": diameter(world),
         "period": period(world),
         "m_with_actions": past_memory(world, actions=True),
-        "m_without_actions": past_memory(world, actions=False),
-        "n_with_actions": future_memory(world, actions=True),
-        "n_with_actions_literal": future_memory(world, actions=True, literal=True),
     }
 
 
