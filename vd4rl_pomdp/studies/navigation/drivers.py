@@ -204,6 +204,10 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
             f"training a policy needs stable-baselines3 ({error}): `pip install '.[policy]'` in the package's folder"
         ) from None
 
+    def report(*_: Any) -> bool:
+        progress.advance(_PARALLEL)
+        return True  # false would stop the training
+
     environments = DummyVecEnv([lambda: FirstPersonEnv(config.maze, config.action_repeat) for _ in range(_PARALLEL)])
     model = PPO(
         "MlpPolicy",
@@ -218,7 +222,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     )
     model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
-        model.learn(config.decisions, callback=lambda *_: progress.advance(_PARALLEL) is None)  # false would stop it
+        model.learn(config.decisions, callback=report)
     policy: Any = model.policy
     layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
     weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}
