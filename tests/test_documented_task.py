@@ -21,7 +21,7 @@ from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import read_shard
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data import View, open_dataset
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
@@ -130,21 +130,6 @@ def test_impossible_collections_write_nothing(tasks, tmp_path, changes, message)
     with pytest.raises(UserError, match=message):
         collect(config)
     assert not (tmp_path / "set").exists()
-
-
-@pytest.mark.parametrize(
-    ("task", "message"),
-    [
-        (GymnasiumTask("Centre-v0", pixels="Render"), "unknown pixels 'Render'"),
-        (GymnasiumTask("Centre-v0", action_noise=-1.0), "its action_noise is -1.0: it must be 0 or a positive number"),
-        (GymnasiumTask("Centre-v0", action_noise="0.3"), "its action_noise is '0.3'"),
-        (GymnasiumTask("Centre-v0", score_divisor="10"), "its score_divisor is '10': it must be a positive number"),
-        (DMCTask("cartpole", "swingup", camera="side"), "its camera is 'side': it must be the camera's number"),
-    ],
-)
-def test_invalid_tasks_are_rejected_on_registration(tasks, task, message):
-    with pytest.raises(UserError, match=f"task 'mine': {message}"):
-        TASKS.register("mine", task)
 
 
 def test_too_small_frames_are_rejected_before_training(tasks, tmp_path):

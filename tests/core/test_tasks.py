@@ -134,21 +134,30 @@ def test_unknown_dm_control_task_lists_the_choices():
         layout_of(DMCTask("carpole", "swingup"))
 
 
+BOTH, GYMNASIUM, DMC = (DMCTask, GymnasiumTask), (GymnasiumTask,), (DMCTask,)
+
+
 @pytest.mark.parametrize(
-    ("numbers", "message"),
+    ("kinds", "settings", "message"),
     [
-        ({"decisions": 0}, "task 'mine': its decisions is 0: it must be an integer from 1"),
-        ({"decisions": 2**20}, "task 'mine': its decisions is 1048576: it must be an integer from 1 to 1048575"),
-        ({"action_repeat": 0}, "task 'mine': its action_repeat is 0: it must be an integer from 1"),
-        ({"decisions": 20.5}, "task 'mine': its decisions is 20.5: it must be an integer from 1"),
-        ({"score_divisor": 0.0}, "task 'mine': its score_divisor is 0.0: it must be a positive number"),
-        ({"score_divisor": -10.0}, "its score_divisor is -10.0: it must be a positive number"),
-        ({"score_divisor": np.nan}, "its score_divisor is nan: it must be a positive number"),
+        (BOTH, {"decisions": 0}, "its decisions is 0: it must be an integer from 1"),
+        (BOTH, {"decisions": 2**20}, "its decisions is 1048576: it must be an integer from 1 to 1048575"),
+        (BOTH, {"decisions": 20.5}, "its decisions is 20.5: it must be an integer from 1"),
+        (BOTH, {"action_repeat": 0}, "its action_repeat is 0: it must be an integer from 1"),
+        (BOTH, {"score_divisor": 0.0}, "its score_divisor is 0.0: it must be a positive number"),
+        (BOTH, {"score_divisor": -10.0}, "its score_divisor is -10.0: it must be a positive number"),
+        (BOTH, {"score_divisor": np.nan}, "its score_divisor is nan: it must be a positive number"),
+        (BOTH, {"score_divisor": "10"}, "its score_divisor is '10': it must be a positive number"),
+        (BOTH, {"action_noise": -1.0}, "its action_noise is -1.0: it must be 0 or a positive number"),
+        (BOTH, {"action_noise": "0.3"}, "its action_noise is '0.3'"),
+        (GYMNASIUM, {"pixels": "Render"}, "unknown pixels 'Render'"),
+        (DMC, {"camera": "side"}, "its camera is 'side': it must be the camera's number"),
     ],
 )
-def test_invalid_task_numbers_are_rejected(numbers, message):
-    for task in (DMCTask("cartpole", "swingup", **numbers), GymnasiumTask("CartPole-v1", **numbers)):
-        with TASKS.isolated(), pytest.raises(UserError, match=message):
+def test_invalid_task_settings_are_rejected(kinds, settings, message):
+    for kind in kinds:
+        task = kind(*{DMCTask: ("cartpole", "swingup"), GymnasiumTask: ("CartPole-v1",)}[kind], **settings)
+        with TASKS.isolated(), pytest.raises(UserError, match=f"task 'mine': {message}"):
             TASKS.register("mine", task)
 
 
