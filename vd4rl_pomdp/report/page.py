@@ -258,8 +258,7 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     refuse_loss(results, out)  # check early: drawing takes most of the time
     if all(run.stage == "navigation" for run in runs):
         raise UserError(f"{paths[0]}: holds no evaluated run; `vd4rl-pomdp navigation report` reports its mazes")
-    named = {path.resolve() for path in paths}
-    certificates = certificates_of(results, paths, None if out.resolve() in named else out)
+    certificates = certificates_of(results, paths)
     made, judged, claimed = _tables(runs, choice, verdicts(runs, certificates))
     shown, plots, mixed = shown_tables(made), draw_plots(runs, made), unlike(runs)
     page = _page(runs, made, shown, plots, mixed, load_section(paths))

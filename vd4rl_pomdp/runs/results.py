@@ -212,7 +212,7 @@ def read_run(folder: Path | str) -> Result:
 def _id(run: Result) -> str:
     """Its identity. If a policy's encoder or data are not fully recorded, a hash of what is."""
     data = run.record.get("inputs", {}).get("data")
-    if data and ({"settings", "seed"} <= run.card.keys() or run.record["stage"] != "finetune"):
+    if data and (run.record["stage"] != "finetune" or run._settings_card):
         return identity(run.record, run.card)
     return content_hash([run.record["stage"], settings_of(run.record["config"]), run.labels, run.card, data])
 
@@ -339,7 +339,7 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
         longer = {run.id: run for run in again if run.extends(there[run.id]) and not there[run.id].extends(run)}
         if fresh or longer:
             write_results(out, (there | fresh | longer).values())
-        keep_certificates(out, certificates_of(found, map(Path, paths), out))
+        keep_certificates(out, certificates_of(found, map(Path, paths)))
     known = sum(there[run.id].extends(run) for run in again)
     counts = {
         f"run{'s' * (len(fresh) != 1)} added": len(fresh) or "0",
@@ -364,15 +364,14 @@ def _rank(certificate: Row) -> tuple[int, int, str]:
     return budget.get("updates", 0), budget.get("steps", 0), str(certificate["made"])
 
 
-def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+def read_certificates(places: Iterable[Path]) -> dict[str, Row]:
     """All certificates at or below some folders, by id; of duplicates that of the largest budget, then the newest.
 
-    The own file of `but` is skipped. UserError if a file is damaged.
+    UserError if a file is damaged.
     """
     found: dict[str, Row] = {}
     for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
-        here = {} if but is not None and file.parent.resolve() == but.resolve() else read_json(file)
-        for name, one in here.items():
+        for name, one in read_json(file).items():
             if not (isinstance(one, dict) and one.keys() >= _HOLDS):
                 raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
             found[name] = max(found.get(name, one), one, key=_rank)
@@ -393,10 +392,10 @@ def certificate_in_words(certificate: Row) -> str:
     return f"{certificate['verdict']} ({certificate['why']})"
 
 
-def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+def certificates_of(runs: Sequence[Result], places: Iterable[Path]) -> dict[str, Row]:
     """Certificates that apply to some runs, by id: found as by `read_certificates`, and in runs' dataset folders."""
     sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
-    known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())], but)
+    known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())])
     return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
 
 
