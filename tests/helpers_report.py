@@ -95,7 +95,7 @@ def write_seeds(
 
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip figures, which take most of a report's time."""
-    sections = ("scores", "lead", "profiles", "curves", "probes", "errors", "costs", "losses")
+    sections = ("scores", "lead", "profiles", "curves", "probes", "errors", "losses")
     monkeypatch.setattr(page, "draw_plots", lambda runs, made: {name: [] for name in sections})
 
 

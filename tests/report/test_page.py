@@ -290,7 +290,7 @@ def test_figures_have_files_alternative_text_and_n(tmp_path, figure_files):
     page, *_ = write_report([runs], tmp_path / "out")
     folder = tmp_path / "out" / "figures"
     found = {path.name for path in folder.iterdir()}
-    names = {"scores_patch", "profiles", "curves_patch", "probes_patch", "errors_patch", "costs", "losses"}
+    names = {"scores_patch", "profiles", "curves_patch", "probes_patch", "errors_patch", "losses"}
     assert found == {f"{name}.{kind}" for name in names for kind in ("csv", "png", "pdf")}
     shown = Page(page)
     assert {link for link in shown.links if link.startswith("figures/")} == {f"figures/{name}" for name in found}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from matplotlib.figure import Figure
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.text import plain
 from vd4rl_pomdp.report import stats, tables
-from vd4rl_pomdp.report.load import ACTION_ERRORS, COSTS, PROBES, REFERENCES, SETTING, Run, labels
+from vd4rl_pomdp.report.load import ACTION_ERRORS, CONDITION, PROBES, REFERENCES, SETTING, Run, labels
 from vd4rl_pomdp.runs.files import replacing_file
 
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"  # else SVG ids are random, and no two pages are equal
@@ -43,15 +42,14 @@ WIDTH, HEIGHT = 10.0, 2.1  # width of a figure and default height of a panel, in
 Draw = Callable[[Axes, pd.DataFrame], None]
 QUALITIES = ("expert", "medium_expert", "medium")  # qualities in the paper's figures, which come first
 NAME_WIDTH = 28  # characters after which a method's name is wrapped
-MANY = 300  # number of dots above which a figure's dots are rasterised
+MANY = 100  # number of dots above which a panel's dots are rasterised
 
 
 class Plot(NamedTuple):
-    """A figure, its data as in its CSV file, the base name of its files, and alternative text in words."""
+    """A figure, its data as in its CSV file, and the base name of its files."""
 
     name: str
     caption: str
-    words: str
     figure: Figure
     rows: pd.DataFrame
 
@@ -160,43 +158,42 @@ def draw_plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list
         "lead": lead_plots(made["lead"]),
         "curves": curve_plots(made["curves"], looks),
         **{name: dot_plots(made["runs"], looks, name) for name in DOTS},
-        "costs": cost_plots(made["costs"]),
         "losses": loss_plots(losses, looks),
     }
 
 
-def _figures(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[tuple[str, pd.DataFrame]]]]:
-    """By corruption: its rows, and title and rows of each task and quality, the paper's qualities first."""
-    rank = rows["quality"].map({name: place for place, name in enumerate(QUALITIES)}).fillna(len(QUALITIES))
-    for corruption, mine in rows.assign(_rank=rank, label=labels(rows)).groupby("corruption", sort=False):
-        ordered = mine.sort_values(["_rank", "quality", "task"], kind="stable").drop(columns="_rank")
-        places = ordered.groupby(["task", "quality"], sort=False)
-        yield str(corruption), ordered, [(" ".join(place), members) for place, members in places]
-
-
-def _by_label(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    return ((str(name), mine) for name, mine in rows.groupby("label", sort=False))
-
-
-def _in_words(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 1) -> str:
-    """A figure's content in words: the last value of each method."""
-    known = [(title, _by_label(rows[rows[value].notna()])) for title, rows in places]
-    texts = ((title, (f"{name} {rows[value].iloc[-1]:.{digits}f}" for name, rows in lines)) for title, lines in known)
-    return "; ".join(f"{title}: {', '.join(words)}" for title, words in texts)
+def _plots(
+    table: pd.DataFrame,
+    name: str,
+    caption: str,
+    draw: Draw,
+    columns: int = 3,
+    panel: Sequence[str] = ("task", "quality"),
+    count: str = "seeds",
+    height: Callable[[pd.DataFrame], float] = lambda rows: HEIGHT,
+) -> list[Plot]:
+    """One figure per corruption, one panel per value of the columns `panel`; `count` is the column with its n."""
+    rank = table["quality"].map({name: place for place, name in enumerate(QUALITIES)}).fillna(len(QUALITIES))
+    ordered = table.assign(rank=rank, label=labels(table)).sort_values(["rank", "quality", "task"], kind="stable")
+    plots = []
+    for corruption in table["corruption"].unique():
+        rows = ordered[ordered["corruption"] == corruption].drop(columns="rank")
+        panels = [(" ".join(place), members, draw) for place, members in rows.groupby(list(panel), sort=False)]
+        figure = sheet(panels, columns, [height(members) for _, members, _ in panels])
+        text = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows[count], count.removesuffix('s'))}"
+        plots.append(Plot(file_name(name, corruption), text, figure, rows))
+    return plots
 
 
 def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Final scores: one figure per corruption, one panel per task and quality, one bar per method, one dot per run.
-
-    Titles have the data's score, which `gates` tell; `looks` is the style number of every label.
-    """
-    titles = {}
-    for row in gates.to_dict("records"):
-        if pd.notna(row["data_return"]) and row["task"] in TASKS:
-            place, score = f"{row['task']} {row['quality']}", row["data_return"] / TASKS[row["task"]].score_divisor
-            titles[place] = f"{place} (data score {score:.1f})"
-    seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table), kind="seed")
-    dots = seeds.groupby([*SETTING, "label"])["score"].agg(list).to_dict()
+    """Final scores: one bar per method, one dot per run, and the data's score in the title."""
+    data = {
+        (row["task"], row["quality"]): row["data_return"] / TASKS[row["task"]].score_divisor
+        for row in gates.to_dict("records")
+        if pd.notna(row["data_return"]) and row["task"] in TASKS
+    }
+    seeds = runs[runs["score"].notna()].assign(label=labels, kind="seed")
+    dots = seeds.groupby([*SETTING, "label"])["score"].agg(list)
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         names = []
@@ -215,23 +212,27 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
         axes.set_ylim(max(len(rows), 4) - 0.4, -0.6)
         axes.grid(axis="y", visible=False)
         axes.set_xlabel("score")
+        if (score := data.get((row["task"], row["quality"]))) is not None:
+            axes.set_title(f"{axes.get_title()} (data score {score:.1f})", fontsize=9)
         if axes.dataLim.x0 >= 0:
             axes.set_xlim(left=0)
-
-    def shown(rows: pd.DataFrame) -> pd.DataFrame:
-        columns = ["kind", *SETTING, "label", "seed", "score", "low", "high", "seeds", "best_score", "missing"]
-        both = pd.concat([rows.assign(kind="mean"), seeds[seeds["corruption"] == rows["corruption"].iloc[0]]])
-        return both.reindex(columns=columns).rename(columns={"label": "method"})
 
     caption = (
         "Final scores under {}. Bars: mean over seeds at the last evaluation; lines: 95% t intervals over seeds and "
         "episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; missing: "
         "seeds without a finished run."
     )
-    scored = summary[summary["score"].notna()]
-    return _plots(
-        scored, "scores", caption, draw, "score", 2, titles, shown, lambda rows: 0.3 + 0.2 * max(len(rows), 4)
-    )
+    scored = summary[summary["score"].notna()].assign(kind="mean")
+    plots = _plots(scored, "scores", caption, draw, 2, height=lambda rows: 0.3 + 0.2 * max(len(rows), 4))
+    columns = ["kind", *SETTING, "label", "seed", "score", "low", "high", "seeds", "best_score", "missing"]
+    for number, plot in enumerate(plots):
+        both = pd.concat([plot.rows, seeds[seeds["corruption"] == plot.rows["corruption"].iloc[0]]])
+        plots[number] = plot._replace(rows=both.reindex(columns=columns).rename(columns={"label": "method"}))
+    return plots
+
+
+def _by_label(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    return ((str(name), mine) for name, mine in rows.groupby("label", sort=False))
 
 
 def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str, **more: Any) -> None:
@@ -243,53 +244,30 @@ def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str
         if "low" in mine:
             band = mine["low"].astype(float), mine["high"].astype(float)
             axes.fill_between(mine[x], *band, color=look["color"], alpha=0.1, lw=0, **fill)
-    axes.set(xlabel=x, ylabel=y)
 
 
 def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Score over updates: one figure per corruption, one line per method; none where all were evaluated once."""
+    """Score over updates, one line per method; none where all were evaluated once."""
     curves = curves[curves.groupby(list(SETTING))["step"].transform("nunique") > 1]
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "step", "score")
-        axes.set(xlabel="gradient updates", xlim=(0, None))
+        axes.set(xlabel="gradient updates", ylabel="score", xlim=(0, None))
         axes.set_ylim(1.05 * min(0.0, rows["low"].min()), 1.05 * max(rows["high"].max(), 0.0) or 1.0)
 
     caption = "Learning curves under {}: mean over the seeds evaluated there, bands from the lowest to the highest "
     caption += "seed, including unfinished runs."
-    return _plots(curves, "curves", caption, draw, "score")
+    return _plots(curves, "curves", caption, draw)
 
 
 def loss_plots(losses: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Action loss over pretraining steps: one figure per corruption, one line per method."""
+    """Action loss over pretraining steps, one line per method."""
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "step", "action_loss", marker=None)
         axes.set(xlabel="gradient steps", ylabel="action loss")
 
-    caption = "Action loss of pretraining under {}, mean over finished runs."
-    return _plots(losses, "losses", caption, draw, "action_loss")
-
-
-def _plots(
-    table: pd.DataFrame,
-    name: str,
-    caption: str,
-    draw: Draw,
-    value: str,
-    columns: int = 3,
-    titles: Mapping[str, str] = {},
-    shown: Callable[[pd.DataFrame], pd.DataFrame] = lambda rows: rows,
-    height: Callable[[pd.DataFrame], float] = lambda rows: HEIGHT,
-) -> list[Plot]:
-    """One figure per corruption, one panel per task and quality."""
-    plots = []
-    for corruption, rows, places in _figures(table):
-        panels = [(titles.get(place, place), members, draw) for place, members in places]
-        figure = sheet(panels, columns, [height(members) for _, members in places])
-        text = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows['seeds'])}"
-        plots.append(Plot(file_name(name, corruption), text, _in_words(places, value), figure, shown(rows)))
-    return plots
+    return _plots(losses, "losses", "Action loss of pretraining under {}, mean over finished runs.", draw)
 
 
 def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
@@ -303,22 +281,16 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
         axes.set_xlim(rows["threshold"].min(), rows["threshold"].max())
 
     shown = profiles.assign(label=profiles["method"])
-    panels = [(str(corruption), members) for corruption, members in shown.groupby("corruption", sort=False)]
-    lacking = aggregate[(aggregate["tasks"] < aggregate["of_tasks"]) & (aggregate["tasks"] > 0)]
-    partial = zip(lacking["corruption"], labels(lacking), lacking["tasks"], lacking["of_tasks"], strict=True)
     caption = (
         "Performance profiles: share of the runs of all tasks and seeds whose final score is above a threshold, with "
-        f"pointwise 95% bands. {seeds_note(aggregate['seeds'])} "
-        + "; ".join(f"{name} under {corruption}: {tasks} of {of} tasks" for corruption, name, tasks, of in partial)
-    ).strip()
-    middle = [(title, members[members["threshold"] <= 50]) for title, members in panels]
-    words = f"Share of runs above 50: {_in_words(middle, 'share', 2)}"
-    figure = sheet([(title, members, draw) for title, members in panels], 2)
-    return [Plot("profiles", caption, words, figure, shown)]
+        f"pointwise 95% bands. {seeds_note(aggregate['seeds'])}"
+    )
+    panels = [(str(corruption), members, draw) for corruption, members in shown.groupby("corruption", sort=False)]
+    return [Plot("profiles", caption, sheet(panels, 2), shown)]
 
 
 def lead_plots(leads: pd.DataFrame) -> list[Plot]:
-    """Differences over the pretraining budget: one figure per corruption, one line per difference."""
+    """Differences over the pretraining budget, one line per difference."""
     if leads.empty:
         return []
     looks = {name: number for number, name in enumerate(sorted(set(labels(leads))))}
@@ -344,7 +316,7 @@ def lead_plots(leads: pd.DataFrame) -> list[Plot]:
         "Lead by pretraining budget under {}: difference of mean returns, each in % of the mean return of "
         "its own data, with 95% t intervals over seeds and episodes if both sides have two seeds."
     )
-    return _plots(leads, "lead", caption, draw, "difference", 2)
+    return _plots(leads, "lead", caption, draw, 2)
 
 
 DOTS = {
@@ -366,47 +338,19 @@ def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot
     """Return over probe errors or action errors: one dot per run, two panels per setting."""
     measures, axis, description = DOTS[name]
 
-    def draw(column: str, many: bool, axes: Axes, rows: pd.DataFrame) -> None:
-        for label, mine in _by_label(rows[rows[column].notna()]):
+    def draw(axes: Axes, rows: pd.DataFrame) -> None:
+        for label, mine in _by_label(rows.dropna(subset="error")):
             look = style(looks[label])
-            marks = {"marker": look["marker"], "ec": "white", "lw": 0.5, "rasterized": many}
-            axes.scatter(mine[column], mine["return"], 26, look["color"], label=plain(label, NAME_WIDTH), **marks)
+            marks = {"marker": look["marker"], "ec": "white", "lw": 0.5, "rasterized": len(rows) > MANY}
+            axes.scatter(mine["error"], mine["return"], 26, look["color"], label=plain(label, NAME_WIDTH), **marks)
         axes.set(xlabel=axis, ylabel="return")
         axes.update_datalim([(0, 0)])
         axes.autoscale_view()
 
     known = runs[runs["return"].notna() & runs[list(measures)].notna().any(axis=1)]
-    plots = []
-    for corruption, rows, places in _figures(known):
-        panels = [
-            (f"{title}, {words}", members, partial(draw, column, len(rows) > MANY))
-            for title, members in places
-            for column, words in measures.items()
-        ]
-        caption = f"Final return under {corruption} against {description}; further left is better. One dot per run, "
-        caption += f"n = {len(rows)} runs."
-        shown = rows[[*SETTING, "label", "seed", *measures, "return"]].rename(columns={"label": "method"})
-        words, figure = f"Returns: {_in_words(places, 'return', 0)}", sheet(panels, 4 if len(places) > 1 else 2)
-        plots.append(Plot(file_name(name, corruption), caption, words, figure, shown))
-    return plots
-
-
-def cost_plots(costs: pd.DataFrame) -> list[Plot]:
-    """Mean minutes of pretraining and fine-tuning, as stacked bars by method."""
-    rows = costs[costs[list(COSTS)].notna().any(axis=1)]
-    if rows.empty:
-        return []
-
-    def draw(axes: Axes, rows: pd.DataFrame) -> None:
-        minutes = (rows.set_index("method")[list(COSTS)] / 60).set_axis(["pretraining", "fine-tuning"], axis=1)
-        minutes.rename(index=plain).plot.barh(ax=axes, stacked=True, width=0.7, color=COLOURS[:2], legend=False)
-        axes.invert_yaxis()
-        axes.set_ylabel("")
-
-    caption = (
-        "Cost of pretraining and fine-tuning: mean wall-clock time over a method's finished runs of all settings, on "
-        f"the machines of the table. {seeds_note(rows['runs'], 'run')}"
+    known = known.assign(runs=known.groupby("corruption")["corruption"].transform("size"))
+    shown = known.rename(columns=measures).melt(
+        [*CONDITION, "seed", "return", "runs"], [*measures.values()], "error of", "error"
     )
-    words = _in_words([("seconds of fine-tuning", rows.assign(label=rows["method"]))], "finetune_seconds", 0)
-    figure = sheet([("mean minutes of a run", rows, draw)], 1, [0.4 + 0.2 * len(rows)])
-    return [Plot("costs", caption, words, figure, rows)]
+    caption = f"Final return under {{}} against {description}; further left is better. One dot per run."
+    return _plots(shown, name, caption, draw, 4, ("task", "quality", "error of"), "runs")
