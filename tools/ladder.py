@@ -18,7 +18,8 @@ import sys
 import time
 from pathlib import Path
 
-from vd4rl_pomdp.runs.files import write_csv
+from vd4rl_pomdp.core.reading import safetensors_metadata
+from vd4rl_pomdp.runs.files import write_bytes, write_csv
 
 RESULTS = Path(__file__).parent.parent / "results" / "ladder"
 CURVES = ("q", "critic_loss", "actor_loss", "bc_loss")
@@ -28,17 +29,11 @@ PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 def keep_policies(runs: Path, snapshots: Path) -> None:
     """Copy each new policy version to a file named by its update."""
     for weights in runs.rglob("policy/model.safetensors"):
-        # an open file keeps its content when a new version replaces it
-        with weights.open("rb") as file:
-            header = file.read(int.from_bytes(file.read(8), "little"))
-            step = json.loads(header)["__metadata__"]["step"]
-            kept = snapshots / weights.parent.parent.relative_to(runs) / f"{step}.safetensors"
-            if not kept.exists():
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                file.seek(0)
-                fresh = kept.with_suffix(".part")
-                fresh.write_bytes(file.read())
-                fresh.replace(kept)
+        content = weights.read_bytes()  # read once, as a new version may replace the file at any time
+        step = safetensors_metadata(content)["step"]
+        kept = snapshots / weights.parent.parent.relative_to(runs) / f"{step}.safetensors"
+        if not kept.exists():
+            write_bytes(kept, content)
 
 
 def keep_rows(runs: Path) -> int:

@@ -30,13 +30,12 @@ from safetensors.torch import load_file, save_file
 from script import run_script
 
 from finetune.features import FrozenEncoder
-from vd4rl_pomdp.core.reading import read_tensors
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.folder import PROVENANCE
-from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.nn.encoder_folder import load_encoder
+from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.runs import CONFIG_FILE, LABELS_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import read_json, write_csv
 
@@ -100,26 +99,19 @@ def cloning_losses(run: Path, files: list[Path], data: Path | None) -> list[floa
         data: the dataset; None: the run's own.
     """
     config = read_json(run / CONFIG_FILE)["config"]
-    record = read_json(run / "encoder" / CONFIG_FILE)
-    settings = record["encoder"]
-    if "gru_layers" in settings:  # folders from before memory options
-        layers = settings.pop("gru_layers")
-        settings["memory_options"] = {"gru_layers": layers} if settings["history"] == "gru" else {}
-    encoder = Encoder(EncoderConfig(**settings))
-    encoder.load_state_dict(read_tensors(run / "encoder" / "model.safetensors"))
-    dataset, corruption = open_dataset(data or config["data"]), CorruptionConfig.fill(record["pretrain"]["corruption"])
-    frozen = FrozenEncoder(encoder.eval(), dataset, corruption, 0, config["precision"], config["seed"])
-    policies = [Policy(**read_json(run / "policy" / CONFIG_FILE)) for _ in files]
-    for policy, file in zip(policies, files, strict=True):
-        policy.load_state_dict(read_tensors(file))
-        policy.eval()
-    squares: list[list[np.ndarray]] = [[] for _ in policies]
+    encoder, card = load_encoder(run / "encoder")
+    dataset, policy = open_dataset(data or config["data"]), load_policy(run / "policy")
+    corruption = CorruptionConfig.fill(card.corruption)
+    frozen = FrozenEncoder(encoder, dataset, corruption, 0, config["precision"], config["seed"])
     view = frozen.view(config["views"])
-    for number in np.unique(np.linspace(0, dataset.num_episodes - 1, EPISODES).astype(int)).tolist():
-        states, actions = frozen.episode(number, view)[:-1], dataset.action[dataset.rows_of(number)][1:]
-        for policy, found in zip(policies, squares, strict=True):
-            found.append((policy(states) - actions).square().mean(1).numpy())
-    return [float(np.concatenate(found).mean()) for found in squares]
+    numbers = np.unique(np.linspace(0, dataset.num_episodes - 1, EPISODES).astype(int)).tolist()
+    states = torch.cat([frozen.episode(number, view)[:-1] for number in numbers])
+    actions = torch.cat([dataset.action[dataset.rows_of(number)][1:] for number in numbers])
+    losses = []
+    for file in files:
+        policy.load_state_dict(load_file(file))
+        losses.append(float((policy(states) - actions).square().mean()))
+    return losses
 
 
 def averages(run: Path, snapshots: Mapping[int, Path], lacking: list[int], work: Path) -> list[tuple[Any, ...]]:

@@ -5,8 +5,6 @@ python tools/ladder_table.py    # draws results/ladder/ladder.png and prints the
 
 from __future__ import annotations
 
-import csv
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -32,11 +31,6 @@ NEAR = 1.02
 """A held-out cloning loss counts as near the minimum up to this factor."""
 UNTRAINED = ("random", "state")
 """Methods without a trained encoder, to which the rule does not apply."""
-FILES = {
-    "curves.csv": {"q": "q", "bc_loss": "batches"},
-    "cloning.csv": {"held_out": "held_out", "trained_on": "trained_on"},
-}
-"""By file, its columns and the attributes of `Cell` that hold them."""
 LOOKS = looks_of(())
 """Plot style by method."""
 BASE = (256, "bf16", 3000, 100, 4)
@@ -143,25 +137,25 @@ def budget(cells: Sequence[Cell]) -> int | None:
 
 def cells_in() -> list[Cell]:
     """Finished runs of results/ladder with its curves.csv and cloning.csv, in grid order."""
-    known: defaultdict[str, dict[str, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
-    for file, names in FILES.items():
-        with (RESULTS / file).open(newline="") as rows:
-            for row in csv.DictReader(rows):
-                for column, name in names.items():
-                    known[row["run"]][name][int(row["step"])] = float(row[column])
+    curves, cloning = (
+        dict(list(pd.read_csv(RESULTS / file, index_col="step", float_precision="round_trip").groupby("run")))
+        for file in ("curves.csv", "cloning.csv")
+    )
     cells = {}
     for run in read_results(RESULTS):
         if run.record["stage"] == "finetune" and run.finished:
             config = run.record["config"]
             card = run.card | {"corruption": run.card["corruption"]["corruption"]}
-            name = next(name for name in known if config["out"].endswith(name))
+            name = next(name for name in curves if config["out"].endswith(name))
+            q, batches = (curves[name][column].to_dict() for column in ("q", "bc_loss"))
+            held_out, trained_on = (cloning[name][column].to_dict() for column in ("held_out", "trained_on"))
             trained = (row for row in run.rows if row["evaluated_under"] == row["corruption"])
             by_rung = groups(trained, lambda row: row["step"])
             returns = {rung: {row["episode_seed"]: row["return"] for row in rows} for rung, rows in by_rung.items()}
             clean = [row["return"] for row in run.rows if row["evaluated_under"] == "none"]
             key, clean = _key(run.record["collection"], card, config), clean[-len(returns[max(returns)]) :]
             data, gamma = run.files["reference"]["data_return"], config["gamma"]
-            cells[key] = Cell(key, **known[name], returns=returns, clean=clean, data_return=data, gamma=gamma)
+            cells[key] = Cell(key, q, held_out, trained_on, batches, returns, clean, data, gamma)
     return [cells[key] for key in grid_keys() if key in cells]
 
 
