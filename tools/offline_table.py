@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,9 @@ from scipy.stats import spearmanr
 
 from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.report import load
-from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
+from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, difference, episodes_of, gates, returns_of, sides
 from vd4rl_pomdp.report.load import PROBES, TRAINED_ON_STATES, Run, episodes_frame, load_runs, runs_frame
-from vd4rl_pomdp.report.stats import difference_interval, mean_interval, number, with_interval
+from vd4rl_pomdp.report.stats import mean_interval, number, with_interval
 from vd4rl_pomdp.report.tables import aggregate, evaluations, improvement
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import Row, groups
@@ -51,6 +53,8 @@ CORRUPTIONS = {"patch+zero_frames": "patches and frames", "none": "nothing"}
 """Names of corruptions in the table of methods, in column order."""
 ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
 """Clean evaluations of policies, made after their runs had ended."""
+IDENTIFIED = ("task", "quality", "corruption", "method", "seed")
+"""Columns of ASIDE that identify a run."""
 ERRORS = {
     **dict(zip(PROBES, ("probe of the pose", "probe of the velocity"), strict=True)),
     **dict(zip(load.ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
@@ -59,8 +63,14 @@ ERRORS = {
 
 
 def main_runs() -> list[Run]:
-    """Finished TD3+BC runs of the grids offline and control, without variants."""
-    return [run for run in runs_of(GRIDS, GRIDS) if not run.variant]
+    """Finished TD3+BC runs of the grids offline and control, without variants, with the clean evaluations of ASIDE."""
+    aside = groups(read_episodes(ASIDE), itemgetter(*IDENTIFIED))
+    found = []
+    for run in runs_of(GRIDS, GRIDS):
+        if not run.variant:
+            clean = [] if run.last_clean else aside.get(run.of(IDENTIFIED), [])
+            found.append(replace(run, result=replace(run.result, rows=[*run.result.rows, *clean])))
+    return found
 
 
 def runs_of(grids: Sequence[str], folders: Sequence[str]) -> list[Run]:
@@ -134,21 +144,9 @@ def mean_text(returns: np.ndarray) -> str:
 
 def _difference(runs: Sequence[Run], corruption: str, method: str, other: str, clean: bool) -> str:
     """Difference of two methods' mean returns with its interval; a dash if either was not evaluated so."""
-    one, two = (_episodes(_of(runs, name, corruption), clean) for name in (method, other))
-    if one is None or two is None:
-        return number(None)
-    text = with_interval(one.mean() - two.mean(), *(difference_interval(one, two) or (None, None)), 0)
-    return text if text.startswith("-") else f"+{text}"
-
-
-def _episodes(runs: list[Run], clean: bool) -> np.ndarray | None:
-    """Returns of runs, (n, episodes); None if a policy lacks the clean evaluation."""
-    if not clean or all(run.last_clean for run in runs):
-        return episodes_of(runs, clean) if runs else None
-    names = ("task", "quality", "corruption", "method", "seed")
-    by_run = groups(read_episodes(ASIDE), lambda row: tuple(row[name] for name in names))
-    found = [[row["return"] for row in by_run.get(tuple(run.labels[name] for name in names), ())] for run in runs]
-    return np.array(found) if all(found) else None
+    above, ends = difference(sides(_of(runs, method, corruption), _of(runs, other, corruption)), clean)
+    text = with_interval(above, *ends, 0)
+    return text if above is None or text.startswith("-") else f"+{text}"
 
 
 def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
