@@ -312,12 +312,11 @@ def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Seque
     # A per-task budget is no ablation. As a variant it would split a method in two, with gaps on every other task.
     kept = [dict(one) for one in settings]
     for places in groups(range(len(settings)), alike.__getitem__).values():
-        for name in {name for i in places for name in settings[i]} - {ENCODER_SEED, *DATA}:
-            having = groups((i for i in places if name in settings[i]), sets.__getitem__)
-            values = [{settings[i][name] for i in mine} for mine in having.values()]
-            if all(len(found) == 1 for found in values) and len(set().union(*values)) > 1:
-                for i in places:
-                    kept[i].pop(name, None)
+        table = pd.DataFrame([settings[i] for i in places]).drop(columns=[ENCODER_SEED, *DATA], errors="ignore")
+        by_set = table.groupby([sets[i] for i in places]).nunique()
+        dropped = [name for name in table if by_set[name].max() == 1 and table[name].nunique() > 1]
+        for i in places:
+            kept[i] = without(kept[i], dropped)
     return kept
 
 
@@ -329,29 +328,27 @@ def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list
     """
     words = [""] * len(settings)
     for places in groups((i for i, own in enumerate(settings) if own), alike.__getitem__).values():
-        here = [settings[i] for i in places]
-        names = [name for name in dict.fromkeys(name for one in here for name in one) if name != ENCODER_SEED]
-        columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in here] for name in names}
-        columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
+        table = pd.DataFrame([settings[i] for i in places], places)
+        shared = table.pop(ENCODER_SEED).dropna() if ENCODER_SEED in table else pd.Series()
+        table = table.fillna({name: PLAIN[name] for name in LATER}).fillna(_UNSET)
+        table = table.loc[:, table.nunique() > 1]
         # Options of a plug-in exist only with it, so naming the plug-in suffices.
-        everywhere = [name for name, column in columns.items() if _UNSET not in column]
-        columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
+        everywhere = [name for name in table if (table[name] != _UNSET).all()]
+        table = table.drop(columns=[name for name in table if _decided(table, name, everywhere)])
         presets: list[str] = []
         for name in PRESETS:
-            if name in columns and not _decided(name, columns, presets):
+            if name in table and not _decided(table, name, presets):
                 presets.append(name)
-        columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}
-        for row, (i, one) in enumerate(zip(places, here, strict=True)):
-            own = {name: column[row] for name, column in columns.items()}
-            own |= {name: value for name, value in one.items() if name == ENCODER_SEED}
+        table = table.drop(columns=[name for name in table if _decided(table, name, presets)])
+        for i, row in table.iterrows():
+            own = dict(row) | ({ENCODER_SEED: shared[i]} if i in shared else {})
             words[i] = ", ".join(f"{name} {value}" for name, value in own.items() if value != PLAIN.get(name))
     return words
 
 
-def _decided(name: str, columns: Mapping[str, list[str]], by: Sequence[str]) -> bool:
+def _decided(table: pd.DataFrame, name: str, by: list[str]) -> bool:
     """Whether a setting is a function of others: equal wherever all of them are equal."""
-    deciding = list(zip(*(columns[other] for other in by), strict=True)) or [()] * len(columns[name])
-    return name not in by and len(set(zip(deciding, columns[name], strict=True))) == len(set(deciding))
+    return bool(by) and name not in by and table.groupby(by)[name].nunique().max() == 1
 
 
 def a_set_a_seed(runs: Sequence[Run]) -> bool:
