@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -351,22 +352,21 @@ def _write(out: Path, made: Tables, shown: Shown, plots: Plots) -> None:
 
 def unlike(runs: list[Run]) -> list[str]:
     """Sentences about compared runs that differ in a dataset's content or in a plug-in's code."""
-    found: dict[str, dict[str, set[str]]] = {}
     played = [run for run in runs if run.stage == "finetune" and run.rows]
-    own = {name for name, mine in groups(played, lambda run: run.set_name).items() if load.a_set_a_seed(mine)}
+    found: list[tuple[str, str, Run]] = []
+    for name, mine in groups(played, lambda run: run.set_name).items():
+        if not load.a_set_a_seed(mine):
+            found += [(f"the set of {name} has {{}} contents", run.result.data[:12], run) for run in mine]
     for run in played:
-        states = {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
-        if run.set_name not in own:
-            states = {f"the set of {run.set_name} has {{}} contents": run.result.data[:12]} | states
-        for subject, state in states.items():
-            if state:
-                found.setdefault(subject, {}).setdefault(state, set()).add(label(run.named))
-    return [
-        f"{subject.format(len(known))}: "
-        + "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in known.items())
-        for subject, known in found.items()
-        if len(known) > 1
-    ]
+        found += [(f"{part} has {{}} states of its code", state, run) for part, state in _code(run).items()]
+    sentences = []
+    for subject, members in groups((one for one in found if one[1]), itemgetter(0)).items():
+        by_state = groups(members, itemgetter(1))
+        methods = {state: sorted({run.method for *_, run in mine}) for state, mine in by_state.items()}
+        if len(methods) > 1:
+            states = "; ".join(f"{state} ({', '.join(names)})" for state, names in methods.items())
+            sentences.append(f"{subject.format(len(methods))}: {states}")
+    return sentences
 
 
 def _code(run: Run) -> dict[str, str]:
@@ -377,7 +377,7 @@ def _code(run: Run) -> dict[str, str]:
     found: dict[str, list[str]] = {}
     for record in (run.result.origin, run.record):
         plugins, sources = record.get("plugins", {}), record.get("sources", {})
-        for part in dict.fromkeys((*plugins, *sources)):
+        for part in plugins | sources:
             state = ", ".join(filter(None, (plugins.get(part), sources.get(part))))
             if not (part in found and part.startswith("method ")) and state not in found.get(part, ()):
                 found.setdefault(part, []).append(state)
