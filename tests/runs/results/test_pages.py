@@ -17,6 +17,7 @@ from vd4rl_pomdp.report.gates import episodes_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
 from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.results import read_certificates
 from vd4rl_pomdp.studies.navigation.report import write_report
 from vd4rl_pomdp.studies.navigation.runs import online_error, refitted_error
 
@@ -153,6 +154,15 @@ def test_quoted_intervals_match_committed_rows(page, least, known):
 )
 def test_unsupported_quotes_are_found(text, known):
     assert unknown(text, known) == QUOTED.findall(text)
+
+
+def test_protocol_page_quotes_its_certificates():
+    text = (ROOT / "results" / "protocol" / "README.md").read_text(encoding="utf-8")
+    for certificate in read_certificates([ROOT / "results" / "protocol"]).values():
+        found = certificate["measured"]["R2"]
+        assert certificate["verdict"] in text
+        assert with_interval(*found["methods"]["supervised+a"], 2) in text
+        assert all(with_interval(*values, 2) in text for values in found["above"].values())
 
 
 @pytest.mark.parametrize("place", REPORTS, ids=lambda place: place.name)
