@@ -57,6 +57,9 @@ class Hub:
         self.large: dict[str, bytes] = {}
         self.requests: Counter[str] = Counter()
         """Counts by method and path."""
+        self.ranges: list[str] = []
+        self.cut: Counter[str] = Counter()
+        """Number of responses to cut in the middle, by file."""
         self.damaged: set[str] = set()
         """Files sent with a wrong byte."""
         self.status: dict[str, int] = {}
@@ -100,13 +103,15 @@ class _Handler(BaseHTTPRequestHandler):
                 return handle(self, *found.groups(), body=body)
         raise RefusedError(404, "", f"no such address: {path}")
 
-    def _send(self, status: int, body: bytes = b"", headers: dict[str, str] | None = None) -> None:
+    def _send(self, status: int, body: bytes = b"", headers: dict[str, str] | None = None, cut: bool = False) -> None:
         self.send_response(status)
         for name, value in {"Content-Length": str(len(body)), **(headers or {})}.items():
             self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
-            self.wfile.write(body)
+            self.wfile.write(body[: len(body) // 2] if cut else body)
+        if cut:
+            self.close_connection = True
 
     def _json(self, payload: Any) -> None:
         self._send(200, json.dumps(payload).encode(), {"Content-Type": "application/json"})
@@ -195,7 +200,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._json({"success": True, "commitOid": oid, "commitUrl": address})
 
     def yaml(self, body: bytes) -> None:
-        self._json({"errors": [], "warnings": []})
+        wrong = 'license: "nobody\'s"' in json.loads(body)["content"]
+        payload = json.dumps(
+            {"errors": [{"message": '"license" must be one of [mit]'}] if wrong else [], "warnings": []}
+        )
+        self._send(400 if wrong else 200, payload.encode(), {"Content-Type": "application/json"})
 
     def file(self, name: str, revision: str, path: str, body: bytes) -> None:
         repo = self._repo(name if name.startswith("datasets/") else f"models/{name}")
@@ -206,9 +215,17 @@ class _Handler(BaseHTTPRequestHandler):
         if content is None:
             raise RefusedError(404, "EntryNotFound", "Entry not found")
         digest = hashlib.sha256(content).hexdigest()
+        headers = {"X-Repo-Commit": commit, "ETag": f'"{digest}"', "Accept-Ranges": "bytes"}
         if path in self.hub.damaged:
             content = bytes([content[0] ^ 1]) + content[1:]
-        self._send(200, content, {"X-Repo-Commit": commit, "ETag": f'"{digest}"'})
+        if wanted := re.fullmatch(r"bytes=(\d+)-", self.headers["Range"] or ""):
+            self.hub.ranges.append(path)
+            start = int(wanted[1])
+            headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
+            return self._send(206, content[start:], headers)
+        cut = self.command == "GET" and self.hub.cut[path] > 0
+        self.hub.cut[path] -= cut
+        return self._send(200, content, headers, cut)
 
 
 _REPO = r"((?:datasets/)?[^/]+/[^/]+)"

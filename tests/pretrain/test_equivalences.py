@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.conformance.test_methods import ROWS, batch, build
+from vd4rl_pomdp.testing.methods import ROWS, batch, build
 
 
 def assert_same_logits(first: torch.nn.Module, second: torch.nn.Module) -> None:
