@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,13 +38,15 @@ REFERENCES = {
     "supervised_picture": "`supervised_picture`",
 }
 """Names of the reference methods on the pages."""
+SMALLEST = (*REFERENCES, "no_history", "mik+a", "ah+a")
+"""Methods trained with the smallest budget."""
 HARD = ("hard_no_curtain", "hard_one_curtain", "hard_three_curtains", "hard_first_person")
 STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
 """Names of observation formats other than the preset's on the pages."""
 TRAINING_LOSS = Measure("action_loss", "training", "")
 """The action loss of the paper's tables."""
-_ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
+ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
 
 
 def main_runs() -> list[NavigationRun]:
@@ -81,8 +83,8 @@ def _called(method: str) -> str:
 
 
 def _place_and_speed(numbers: Numbers, condition: Condition) -> str:
-    """Position and velocity errors of the refitted probe, in percent."""
-    return ", ".join(_mean(numbers, condition, error) for error in REFITTED[1:])
+    """Position and velocity errors of the refitted probe, in percent; a dash if there are none."""
+    return ", ".join(_mean(numbers, condition, error) for error in REFITTED[1:]).replace("–, –", "–")
 
 
 def maze_lines(numbers: Numbers, maze: str) -> Iterator[str]:
@@ -110,14 +112,14 @@ def state_lines(numbers: Numbers, settings: Iterable[tuple[str, Condition]]) -> 
     rows = []
     for words, setting in settings:
         for maze in filter(known, PAPER_MAZES):
-            conditions = [setting._replace(maze=maze, method=name) for name in _ORDER]
+            conditions = [setting._replace(maze=maze, method=name) for name in ORDER]
             for name, measure in ((words, PAPERS_WAY[0]), (f"{words}, in %", REFITTED[0])):
                 counts = {len(values(numbers, condition, measure)) for condition in conditions} - {0}
                 if counts:
                     seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
                     cells = (_cell(numbers, condition, measure) for condition in conditions)
                     rows.append((f"{maze.replace('_', ' ')}, {name}", seeds, *cells))
-    return table_lines(("", "seeds", *(f"`{name}`" for name in _ORDER)), rows)
+    return table_lines(("", "seeds", *(f"`{name}`" for name in ORDER)), rows)
 
 
 def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
@@ -150,12 +152,11 @@ def first_person_lines(numbers: Numbers) -> Iterator[str]:
     return table_lines(("", "seeds", "state, position, velocity", "probe beside the model: position, velocity"), rows)
 
 
-def first_rung_lines(numbers: Numbers) -> Iterator[str]:
-    """Errors of position and velocity at the smallest budget, under the stars and under the compass."""
-    methods = (*REFERENCES, "no_history", "mik+a", "ah+a")
-    places = [(name, [Condition(maze, name) for maze in (STARS, COMPASS)]) for name in methods]
-    rows = ((_called(name), *(_place_and_speed(numbers, one) for one in conditions)) for name, conditions in places)
-    return table_lines(("", f"`{STARS}`", f"`{COMPASS}`"), rows)
+def place_lines(numbers: Numbers, mazes: Sequence[str], methods: Iterable[str]) -> Iterator[str]:
+    """Errors of position and velocity at K = 15 by method and maze; a dash for a maze without a run."""
+    rows = ((_called(one), *(_place_and_speed(numbers, Condition(maze, one)) for maze in mazes)) for one in methods)
+    known = (row for row in rows if any(cell != "–" for cell in row[1:]))
+    return table_lines(("", *(f"`{maze}`" for maze in mazes)), known)
 
 
 def picture_lines(usual: Numbers) -> Iterator[str]:
@@ -173,14 +174,3 @@ def picture_lines(usual: Numbers) -> Iterator[str]:
         for words, numbers in settings.items()
     )
     return table_lines(("", *map(_called, methods)), rows)
-
-
-def hard_lines(numbers: Numbers) -> Iterator[str]:
-    """Position and velocity errors at K = 15 in the harder mazes."""
-    rows = []
-    for method in (*_ORDER, *REFERENCES):
-        conditions = [Condition(maze, method) for maze in HARD]
-        if any(values(numbers, condition, REFITTED[1]) for condition in conditions):
-            cells = [_place_and_speed(numbers, condition).replace("–, –", "–") for condition in conditions]
-            rows.append((_called(method), *cells))
-    return table_lines(("", *(f"`{maze}`" for maze in HARD)), rows)

@@ -44,10 +44,14 @@ def pages() -> dict[str, Tables]:
             "textures": mazes.state_lines(numbers, [("textures", condition._replace(exogenous=True))]),
             "budget": mazes.budget_lines(numbers, mazes.numbers_in("budget")),
         },
-        "navigation/longer": {"hard": mazes.hard_lines(numbers)},
+        "navigation/longer": {"hard": mazes.place_lines(numbers, mazes.HARD, (*mazes.ORDER, *mazes.REFERENCES))},
         "navigation/first_person": {"first person": mazes.first_person_lines(mazes.numbers_in("first_person"))},
         "navigation/first_person/pictures": {"pictures": mazes.picture_lines(numbers)},
-        "navigation/first_person/small": {"first rung": mazes.first_rung_lines(mazes.numbers_in("first_person/small"))},
+        "navigation/first_person/small": {
+            "first rung": mazes.place_lines(
+                mazes.numbers_in("first_person/small"), (mazes.STARS, mazes.COMPASS), mazes.SMALLEST
+            )
+        },
         "offline": {
             "returns": offline.return_lines(returns),
             "contrasts": offline.contrast_lines(returns),
