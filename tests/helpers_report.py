@@ -68,6 +68,21 @@ def describe(
     return run
 
 
+def collected(run: Path, content: str, seed: int, **collection: Any) -> Path:
+    """Give a run a dataset with the fingerprint `content`, collected with a seed."""
+    record = read_json(run / "config.json")
+    collection = {"task": "walker_walk", "episodes": 100, "seed": seed} | collection
+    write_json(run / "config.json", record | {"inputs": {"data": content}, "collection": collection})
+    return run
+
+
+def on_own_sets(folder: Path, first: int) -> None:
+    """Give every run of a folder a dataset collected with `first` + its seed."""
+    for run in folder.iterdir():
+        seed = first + read_json(run / "config.json")["config"]["seed"]
+        collected(run, f"{seed}" * 8, seed)
+
+
 def write_seeds(
     folder: Path,
     scores: dict[tuple[str, str], tuple[float, ...]],

@@ -53,7 +53,8 @@ CORRUPTIONS = {"patch+zero_frames": "patches and frames", "none": "nothing"}
 """Names of corruptions in the table of methods, in column order."""
 ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
 """Clean evaluations of policies, made after their runs had ended."""
-IDENTIFIED = ("task", "quality", "corruption", "method", "seed")
+PLACE = ("task", "quality")
+IDENTIFIED = (*PLACE, "corruption", "method", "seed")
 """Columns of ASIDE that identify a run."""
 ERRORS = {
     **dict(zip(PROBES, ("probe of the pose", "probe of the velocity"), strict=True)),
@@ -80,10 +81,6 @@ def runs_of(grids: Sequence[str], folders: Sequence[str]) -> list[Run]:
     return [run for run in found if run.rows and run.finished]
 
 
-def _place(run: Run) -> tuple[str, str]:
-    return run.labels["task"], run.labels["quality"]
-
-
 def _of(runs: Sequence[Run], method: str, corruption: str) -> list[Run]:
     """Runs of a method under a corruption, by seed."""
     mine = [run for run in runs if (run.method, run.labels["corruption"]) == (method, corruption)]
@@ -92,7 +89,7 @@ def _of(runs: Sequence[Run], method: str, corruption: str) -> list[Run]:
 
 def _measured_sets(runs: Sequence[Run]) -> Iterator[tuple[tuple[str, str], str, list[Run]]]:
     """Task and quality, corruption, and the runs under any, of the pages' datasets with results."""
-    by_set = groups(runs, _place)
+    by_set = groups(runs, lambda run: run.of(PLACE))
     for corruption, place in product((HIDDEN, PATCHES), SETS):
         if any(run.labels["corruption"] == corruption for run in by_set.get(place, ())):
             yield place, corruption, by_set[place]
@@ -153,7 +150,7 @@ def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
     """The report's statistics over datasets, for methods that all of them have."""
     main = [run for run in runs if run.labels["corruption"] in (HIDDEN, PATCHES) and run.method in MAIN]
     kinds = groups(
-        (run for run in main if _place(run) in SETS),
+        (run for run in main if run.of(PLACE) in SETS),
         lambda run: (run.labels["quality"] in EXPLORATORY, run.labels["corruption"]),
     )
     rows = []

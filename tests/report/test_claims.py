@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import scipy.stats
 
-from tests.helpers_report import describe, write_run, write_seeds
+from tests.helpers_report import describe, on_own_sets, write_run, write_seeds
 from vd4rl_pomdp.report.gates import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.page import print_summary, write_report
@@ -125,19 +125,10 @@ def test_holm_correction_applies_within_claim_families(tmp_path):
     assert rows[MEMORY]["p"] < 0.05 < rows[MEMORY]["adjusted_p"], "it would hold without adjustment"
 
 
-def on_own_sets(folder: Path, first: int = 100) -> None:
-    """Give every run a dataset collected with `first` + its seed."""
-    for run in folder.iterdir():
-        record = read_json(run / "config.json")
-        seed = record["config"]["seed"]
-        made = {"inputs": {"data": f"{first + seed}" * 8}, "collection": {"task": "walker_walk", "seed": first + seed}}
-        write_json(run / "config.json", record | made)
-
-
 def test_seeds_with_individual_sets_are_compared(tmp_path):
-    on_own_sets(write(tmp_path / "one", GOOD))
+    on_own_sets(write(tmp_path / "one", GOOD), first=100)
     assert judged(tmp_path / "one")[BOTH]["verdict"] == "holds"
-    on_own_sets(write(tmp_path / "two" / "acro", {("acro", "patch"): (20, 22)}))
+    on_own_sets(write(tmp_path / "two" / "acro", {("acro", "patch"): (20, 22)}), first=100)
     on_own_sets(write(tmp_path / "two" / "mik+a", {("mik+a", "patch"): (50, 54)}), first=200)
     assert judged(tmp_path / "two")[BOTH]["verdict"] == "not judged: other data"
 

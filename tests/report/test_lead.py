@@ -8,11 +8,10 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from tests.helpers_report import describe, write_seeds
+from tests.helpers_report import describe, on_own_sets, write_seeds
 from vd4rl_pomdp.report.gates import leads
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.page import write_report
-from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 800.0
 LEAD, OVER_GRU = "mik+a minus acro", "mik+a minus acro with a GRU"
@@ -89,10 +88,7 @@ def test_report_shows_leads_of_several_budgets(runs, tmp_path, figure_files):
 
 def test_leads_with_one_set_per_seed(runs):
     """One side may lack a seed."""
-    for run in runs.iterdir():
-        seed = read_json(run / "config.json")["config"]["seed"]
-        made = {"inputs": {"data": f"{seed}" * 24}, "collection": {"task": "walker_walk", "seed": 100 + seed}}
-        write_json(run / "config.json", read_json(run / "config.json") | made)
+    on_own_sets(runs, first=100)
     assert found(runs)[LEAD, 3000]["difference"] == pytest.approx(10.0)
     shutil.rmtree(next(runs.glob("mik+a-patch-0-*-3000-*")))
     row = found(runs)[LEAD, 3000]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.helpers_report import describe, pooled, write_run
+from tests.helpers_report import collected, describe, pooled, write_run
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report.load import find_gaps, load_runs
 from vd4rl_pomdp.report.page import unlike, write_report
@@ -183,12 +183,11 @@ def test_preset_label_replaces_its_settings(tmp_path):
     assert set(pooled(tmp_path / "runs")) == labels
 
 
-def on_set(folder, method, seed, content, collected, updates=10, **collection):
-    """Write a run on a dataset with fingerprint `content`, collected with seed `collected`."""
+def on_set(folder, method, seed, content, collection_seed, updates=10, **collection):
+    """Write a run on a dataset with fingerprint `content`, collected with a seed."""
     run = write_run(folder / f"{method}-{seed}-{content}-{updates}", method, seed, {10: [1.0]})
-    describe(run, {"data": content}, data=content, seed=seed, updates=updates)
-    collection = {"task": "walker_walk", "episodes": 100, "seed": collected} | collection
-    write_json(run / "config.json", read_json(run / "config.json") | {"collection": collection})
+    describe(run, {"data": content}, seed=seed, updates=updates)
+    collected(run, content, collection_seed, **collection)
 
 
 def test_one_set_per_seed_pools_seeds(tmp_path):
@@ -207,11 +206,11 @@ def test_one_set_per_seed_pools_seeds(tmp_path):
 @pytest.mark.parametrize(
     "other",
     [
-        {"seed": 1, "content": "0" * 24, "collected": 101},
-        {"seed": 1, "content": "1" * 24, "collected": 100},
-        {"seed": 0, "content": "1" * 24, "collected": 101},
-        {"seed": 1, "content": "1" * 24, "collected": 101, "episodes": 200},
-        {"seed": 1, "content": "1" * 24, "collected": 101, "rendered_by": {"canary": "another"}},
+        {"seed": 1, "content": "0" * 24, "collection_seed": 101},
+        {"seed": 1, "content": "1" * 24, "collection_seed": 100},
+        {"seed": 0, "content": "1" * 24, "collection_seed": 101},
+        {"seed": 1, "content": "1" * 24, "collection_seed": 101, "episodes": 200},
+        {"seed": 1, "content": "1" * 24, "collection_seed": 101, "rendered_by": {"canary": "another"}},
     ],
     ids=["same content", "same collection seed", "same seed", "other collection", "other renderer"],
 )

@@ -9,7 +9,6 @@ import tyro
 
 from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, parse, parse_stage
-from vd4rl_pomdp.cli.report import named
 from vd4rl_pomdp.runs import NAVIGATION_FILE
 
 if TYPE_CHECKING:
@@ -55,4 +54,4 @@ def report(
         out: Folder of the report.
         pictures: Also draw sample observations, which needs OpenGL.
     """
-    print(f"report: {reporting.write_report(named(runs), out, mazes.sample_observations if pictures else None)}")
+    print(f"report: {reporting.write_report(runs, out, mazes.sample_observations if pictures else None)}")

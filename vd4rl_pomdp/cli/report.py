@@ -53,18 +53,11 @@ def report(
         choice = members.GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
     elif only or change:
         raise UserError("--only and --change apply to the cells of a grid: add --grid")
-    written = page.write_report(named(runs), out, choice)
+    written = page.write_report(runs, out, choice)
     page.print_summary(written)
     for sentence in written.unlike:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"report: {written.page}")
-
-
-def named(runs: list[Path]) -> list[Path]:
-    """The folders of a command line; UserError if there are none."""
-    if not runs:
-        raise UserError("no runs given: name at least one folder")
-    return runs
 
 
 @command
@@ -95,7 +88,7 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
         runs: Run folders, results folders, or folders that contain some.
         out: The results folder; created if missing.
     """
-    print(f"{out}: {results.add_results(named(runs), out)}")
+    print(f"{out}: {results.add_results(runs, out)}")
 
 
 @command

@@ -35,7 +35,6 @@ from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_
 
 MARK = "summary"  # the table that every report has; its file identifies a report's folder
 WIDEST = 6  # maximum methods side by side in a matrix; further ones go below
-SEEDS = 12  # maximum seeds that are listed individually
 Tables = dict[str, pd.DataFrame]
 Shown = dict[str, tuple[pd.DataFrame, list[Block]]]
 Plots = dict[str, list[Plot]]
@@ -387,11 +386,10 @@ def _code(run: Run) -> dict[str, str]:
 def _facts(name: str, runs: list[Run]) -> dict[str, str]:
     """What all seeds of a condition share, and what they were computed with."""
     seeds = [str(seed) for seed in sorted({int(run.labels["seed"]) for run in runs})]
-    shown = seeds if len(seeds) <= SEEDS else [*seeds[:3], "...", seeds[-1]]
     seconds = [value for run in runs if (value := run.measures["finetune_seconds"]) is not None]
     first = runs[0].record
     return {
-        "title": f"{name}, {'seeds' if len(seeds) > 1 else 'seed'} {', '.join(shown)}",
+        "title": f"{name}, {'seeds' if len(seeds) > 1 else 'seed'} {', '.join(seeds)}",
         "made": made_with(runs),
         "time": f"{min(seconds):.0f} to {max(seconds):.0f} s" if seconds else runs[0].progress,
         "command": first.get("command", ""),
