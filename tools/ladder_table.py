@@ -138,7 +138,7 @@ def budget(cells: Sequence[Cell]) -> int | None:
 def cells_in() -> list[Cell]:
     """Finished runs of results/ladder with its curves.csv and cloning.csv, in grid order."""
     curves, cloning = (
-        dict(list(pd.read_csv(RESULTS / file, index_col="step", float_precision="round_trip").groupby("run")))
+        dict(list(pd.read_csv(RESULTS / file, index_col="step").groupby("run")))
         for file in ("curves.csv", "cloning.csv")
     )
     cells = {}
