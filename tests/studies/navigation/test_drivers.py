@@ -141,3 +141,9 @@ def test_invalid_policy_settings_are_rejected(tmp_path, changes, message):
     with pytest.raises(UserError, match=message):
         train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", **changes))
     assert (tmp_path / "actor.safetensors").read_text() == "mine\n"
+
+
+def test_policy_training_does_not_replace_a_dangling_link(tmp_path):
+    (tmp_path / "actor.safetensors").symlink_to("nothing")
+    with pytest.raises(UserError, match=r"actor\.safetensors: exists already"):
+        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=1))

@@ -193,7 +193,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
     refuse_no_folder(config.out.parent)
     refuse_inside(config.out)
-    if config.out.exists():
+    if config.out.exists() or config.out.is_symlink():
         raise UserError(f"{config.out}: exists already; remove it, or choose another --out")
     try:
         from stable_baselines3 import PPO
