@@ -34,7 +34,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
 def finetune_all(
     configs: Sequence[FinetuneConfig], words: Sequence[Sequence[str] | None] | None = None
 ) -> list[RunFolder]:
-    """Run or resume the stage for several runs, with shared updates (see `finetune.stack`).
+    """Run or resume the stage for several runs in step; on a GPU with shared updates (see `finetune.stack`).
 
     They may differ in seeds, encoder, data and evaluation; `words` are each run's command line, for its record.
 
@@ -119,9 +119,14 @@ class Updates:
         small = config.views > 0 and config.hidden_dim <= ONE_THREAD_UNITS and not self._stack
         self._one_thread = small and device.type == "cpu"
 
-    def __call__(self, made: int) -> dict[str, torch.Tensor]:
-        """Do the update that follows `made` updates. Returns scalars, (S,) for a stack."""
-        turn = made % self._counting.period
+    def __call__(self, made: int) -> list[dict[str, torch.Tensor]]:
+        """Do the update that follows `made` updates. Returns each run's scalars."""
+        logs = self._logs(made % self._counting.period)
+        if not self._stack:
+            return [logs]
+        return [{name: value[run] for name, value in logs.items()} for run in range(len(self._samplers))]
+
+    def _logs(self, turn: int) -> dict[str, torch.Tensor]:
         if not self._one_thread:
             return self._replay(turn)
         threads = torch.get_num_threads()
@@ -144,8 +149,13 @@ class Updates:
             self._samplers[number].draws.set_state(self._sampler.draws.get_state(number))
 
 
+def stacks_on(device: torch.device) -> bool:
+    """Whether runs share updates on a device: a CPU is as fast with one after another, which equals single runs."""
+    return device.type == "cuda"
+
+
 def train(trainers: Sequence[FinetuneTrainer]) -> None:
-    """Train runs to the end: those at the same update together, those that are behind first.
+    """Train runs to the end: those at the same update in step, those that are behind first.
 
     Raises:
         FloatingPointError: a run diverged and is marked; the others were trained to the end.
@@ -175,14 +185,17 @@ def train(trainers: Sequence[FinetuneTrainer]) -> None:
             group = [one for one in behind if one.step == first]
             until = min((one.step for one in left if one.step > first), default=behind[0].config.updates)
             settings = group[0].config
-            updates = Updates([one.algorithm for one in group], [one.sampler for one in group], settings)
-            for number, one in enumerate(group):
-                one.settle = partial(updates.settle, number)
+            updates = []
+            for members in [group] if stacks_on(group[0].device) else [[one] for one in group]:
+                shared = Updates([one.algorithm for one in members], [one.sampler for one in members], settings)
+                updates.append(shared)
+                for number, one in enumerate(members):
+                    one.settle = partial(shared.settle, number)
             for step in in_step(loops := [one.loop for one in group], until):
-                logs = updates(step - 1)
-                for number, one in enumerate(group):
+                logs = [own for shared in updates for own in shared(step - 1)]
+                for one, own in zip(group, logs, strict=True):
                     if one in left:
-                        one.loop.add(logs if len(group) == 1 else {name: value[number] for name, value in logs.items()})
+                        one.loop.add(own)
                         one.step = step
                 if loops[0].due(settings.log_every):
                     each(lambda one: one.loop.log(), group)

@@ -125,7 +125,7 @@ class FinetuneTrainer:
         self.encoder.config = replace(self.encoder.config, **self._changes)
         if self.encoder.reads_state:
             dataset.require_states()
-        self._device = pick_device(config.device)
+        self.device = pick_device(config.device)
         untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
         self.card = replace(card, quality=dataset.quality or untold)  # rows carry the quality of the policy's dataset
         inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
@@ -152,7 +152,7 @@ class FinetuneTrainer:
         config, card, run = self.config, self.card, self.run
         parts, what = self._pretrained.parts, "it was pretrained; pretrain it again"
         warn_of_other_code(config.encoder, vars(self._pretrained), parts, what)
-        device, dataset, encoder = self._device, self.dataset.to(self._device), self.encoder.to(self._device)
+        device, dataset, encoder = self.device, self.dataset.to(self.device), self.encoder.to(self.device)
         write_json(run.path / LABELS_FILE, self.labels)
         if not all((run.path / name).exists() for name in FILES_OF_RUN):
             # copied, with the pretraining's timing, so that the run can be moved and evaluated anywhere

@@ -14,7 +14,7 @@ def test_sections_contain_all_goals(tmp_path, monkeypatch):
     assert opening["rows"] == dataset.num_rows == 8 * suite.EPISODE_ROWS
     sections = {"opening": opening, "sampling": suite.sampling(dataset, 5)}
     monkeypatch.setattr(suite, "BATCH", 4)
-    sections |= {"finetuning": suite.finetuning(dataset, 1), "stacking": suite.stacking(dataset, 1)}
+    sections |= {"finetuning": suite.finetuning(dataset, 1)}
     sections |= {"methods": suite.methods(dataset, tmp_path, 1), "memories": suite.memories(dataset, tmp_path, 1)}
     sections["sharing"] = processes.sharing(0.05, rounds=1)
     measured = flatten(sections)
@@ -50,7 +50,7 @@ def test_sharing_benchmark_compares_two_runs_with_one(monkeypatch):
 def test_training_benchmarks_use_the_selected_device(monkeypatch):
     small = partial(suite.synthetic_set, episodes=1)
     named = ("sampling", "pretraining", "finetuning", "methods", "memories")
-    for name in ("against_jax", "stacking", "memory", "collection", "sharing", "maze_pictures", "maze_training"):
+    for name in ("against_jax", "memory", "collection", "sharing", "maze_pictures", "maze_training"):
         monkeypatch.setattr(suite, name, lambda *_: {})
     for name in named:
         monkeypatch.setattr(suite, name, lambda dataset, *_: {"device": dataset.t.device.type})

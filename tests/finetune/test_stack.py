@@ -1,4 +1,4 @@
-"""Runs trained as a stack equal single runs: folders, records and states, and numbers up to rounding."""
+"""Runs trained together equal single runs: on a CPU exactly; as a stack up to rounding."""
 
 import csv
 import os
@@ -37,7 +37,14 @@ from vd4rl_pomdp.runs.run import identity
 from vd4rl_pomdp.testing.algorithms import course, farther_than_rounding
 
 pytestmark = pytest.mark.usefixtures("own_cache")
+stacked = pytest.mark.usefixtures("stacks")
 BRIEF = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "log_every": 3, "batch_size": 4, "eval_length": 2}
+
+
+@pytest.fixture
+def stacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs share updates on a CPU too."""
+    monkeypatch.setattr(train, "stacks_on", lambda device: True)
 
 
 def same_but_for_rounding(one: Path, other: Path) -> None:
@@ -93,6 +100,8 @@ def test_seeds_option_writes_folders_equal_to_single_runs(encoder, data, tmp_pat
         monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", *words, *call])
         main()
     same_but_for_rounding(tmp_path / "s" / "seed3", tmp_path / "alone")
+    for name in ("metrics.jsonl", "episodes.csv", "policy/model.safetensors"):
+        assert (tmp_path / "s/seed3" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     commands = [read_json(run / "config.json")["command"] for run in (tmp_path / "s" / "seed3", tmp_path / "alone")]
     assert commands[0].replace(str(tmp_path / "s" / "seed3"), str(tmp_path / "alone")) == commands[1]
     card = read_record(encoder).pretrain.__dict__
@@ -126,6 +135,7 @@ def test_stacked_batches_equal_single_batches(tmp_path):
                 assert all(torch.equal(batch[name][number], expected[name]) for name in expected)
 
 
+@stacked
 def test_stacked_runs_resume_alone_or_in_another_stack(encoder, data, tmp_path, monkeypatch):
     """A stack is cut at its second checkpoint; then one member continues alone, and the stack resumes."""
     configs = {name: smoke_finetune(encoder, data, tmp_path / name, **BRIEF, seed=seed) for name, seed in SEEDS.items()}
@@ -154,6 +164,7 @@ def test_stacked_runs_resume_alone_or_in_another_stack(encoder, data, tmp_path, 
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")} == before, "finished runs are not changed"
 
 
+@stacked
 def test_sigterm_saves_all_stacked_runs_after_the_step(encoder, data, tmp_path, monkeypatch):
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(2)]
     call = train.Updates.__call__
@@ -174,6 +185,7 @@ def test_sigterm_saves_all_stacked_runs_after_the_step(encoder, data, tmp_path, 
 SEEDS = {"a": 0, "b": 1, "c": 2, "a alone": 0, "b alone": 1, "c alone": 2}
 
 
+@stacked
 def test_methods_of_equal_width_are_stacked(encoders, data, tmp_path):
     """With and without a memory, and with different seeds and views."""
     given = {"mik+a": {"seed": 1, "view_seed": 7}, "acro": {"seed": 2, "shift": 2, "eval_episodes": 2}}
@@ -188,6 +200,7 @@ def test_methods_of_equal_width_are_stacked(encoders, data, tmp_path):
         same_but_for_rounding(tmp_path / "stacked" / method, tmp_path / "alone" / method)
 
 
+@stacked
 def test_diverged_run_does_not_stop_its_stack(encoder, data, tmp_path, capsys, monkeypatch):
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(3)]
     build = FinetuneTrainer.build
@@ -265,12 +278,11 @@ def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespa
 def course_of(runs: list[SimpleNamespace], updates: int) -> list[dict[str, torch.Tensor]]:
     """Logs and final state of each run; the logs are read after the last update."""
     step = train.Updates([run.algorithm for run in runs], [run.sampler for run in runs], runs[0].config)
-    logs = [step(number) for number in range(updates)]
+    logs = [step(made) for made in range(updates)]
     found = []
     for number, run in enumerate(runs):
         step.settle(number)
-        own = logs if len(runs) == 1 else [{name: value[number] for name, value in row.items()} for row in logs]
-        found.append(course(run.algorithm, own) | {"batches": run.sampler.draws.get_state()})
+        found.append(course(run.algorithm, [row[number] for row in logs]) | {"batches": run.sampler.draws.get_state()})
     return found
 
 

@@ -207,7 +207,7 @@ def stacked(dataset: Dataset, features: torch.Tensor, size: Size) -> dict[str, f
     return {"runs": size.runs, "all_ms": ms, "a_seed_ms": ms / size.runs} | peak(features.device)
 
 
-def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Tensor]]:
+def end_to_end(dataset: Dataset, size: Size) -> Callable[[], object]:
     """A function that makes one update of `drq_bc`, including its encoder."""
     config = finetuning("drqv2_bc", size)
     encoder = Encoder(EncoderConfig(dataset.action_dim)).to(dataset.t.device)

@@ -108,7 +108,6 @@ def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
             "pretraining": pretraining(dataset, folder, repeats),
             "finetuning": finetuning(dataset, repeats),
             "jax": against_jax(dataset, max(2, repeats // 3)),
-            "stacking": stacking(dataset, max(2, repeats // 3)),
             "methods": methods(dataset, folder, repeats),
             "memories": memories(dataset, folder, repeats),
             "memory": memory(folder, dataset.frames.numel()),
@@ -395,19 +394,6 @@ def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 10
     return results
 
 
-def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Milliseconds per update of one policy of the cpu preset, and per policy in a stack of five."""
-    updates, runs, features = 10, 5, random_features(dataset, FinetuneConfig.of("cpu").views)
-    results: dict[str, float] = {}
-    for precision in ("fp32", "bf16"):
-        config = _small(update_precision=precision)
-        both = (_some(updates, on_features(config, dataset, features, count)) for count in (1, runs))
-        one, five = (1e3 * seconds / updates for seconds in alternating(repeats, *both))
-        results |= {f"{precision}_ms": one, f"{precision}_of_five_ms": five / runs}
-        results[f"{precision}_of_five_over_one"] = five / runs / one
-    return results
-
-
 def random_features(dataset: Dataset, views: int) -> torch.Tensor:
     """(views, rows, D) float16 on the dataset's device, with the default frame encoder's width."""
     width = EncoderConfig(dataset.action_dim).feature_dim
@@ -430,7 +416,7 @@ def _some(count: int, update: Callable[[], Any]) -> Callable[[], None]:
 
 def on_features(
     config: FinetuneConfig, dataset: Dataset, features: torch.Tensor, runs: int = 1
-) -> Callable[[], dict[str, torch.Tensor]]:
+) -> Callable[[], object]:
     """A function that makes one update of a run, or of a stack of runs, on cached (V, N, D) features."""
     histories = Histories(dataset, NO_OPTIONS, 3, 0)
     sampler = partial(FeatureSampler, histories, features, config.batch_size, 3, 0.99)
@@ -444,7 +430,7 @@ def next_update(
     batches: Callable[[RandomStream], Any],
     runs: int = 1,
     encoder: Encoder | None = None,
-) -> Callable[[], dict[str, torch.Tensor]]:
+) -> Callable[[], object]:
     """A function that makes one training update of a run, or of a stack of `runs`, including sampling.
 
     `batches` makes a sampler of (B, dim) representations from a random stream; an end-to-end method trains `encoder`.
