@@ -1,4 +1,5 @@
-"""Code blocks of the README and docs/: Python is executed; commands are parsed, and run if that takes seconds."""
+"""Code blocks of the README and docs/: Python is executed; commands are run if that takes seconds. All are parsed, also
+those in results/."""
 
 import functools
 import json
@@ -34,6 +35,7 @@ from vd4rl_pomdp.sweeps.stages import check_cells
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+RESULTS = sorted((ROOT / "results").rglob("*.md"))
 PROGRAMS = (["vd4rl-pomdp"], *(["python", file] for file in EXAMPLES))
 """First words of this project's commands."""
 NOT_RUN = {
@@ -119,10 +121,14 @@ def test_documented_commands_are_run_or_excluded():
     assert [reason for reason in NOT_RUN if not any(line.startswith(reason) for _, line in COMMANDS)] == []
 
 
-OURS = [(page, line) for page, line in COMMANDS if line.split()[:1] in PROGRAMS or line.split()[:2] in PROGRAMS]
+OURS = [
+    (page, line)
+    for page, line in [*COMMANDS, *((page, line) for page in RESULTS for line in commands(page))]
+    if line.split()[:1] in PROGRAMS or line.split()[:2] in PROGRAMS
+]
 
 
-@pytest.mark.parametrize(("page", "line"), OURS, ids=[f"{page.stem}: {line}" for page, line in OURS])
+@pytest.mark.parametrize(("page", "line"), OURS, ids=[f"{page.parent.name}/{page.stem}: {line}" for page, line in OURS])
 def test_documented_commands_parse(page, line, tmp_path, monkeypatch):
     parsed = []
     real = tyro.cli

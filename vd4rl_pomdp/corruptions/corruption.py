@@ -310,7 +310,7 @@ class Corruption:
         if self._drop is None:
             return torch.arange(stack, device=key.device).expand(len(key), stack)
         dropped = self._drop.dropped(stack)
-        return drop_order(self._drop, key, len(self._stages), stack).argsort(dim=1)[:, dropped:]
+        return drop_order(self._drop, key, len(self._stages), stack).argsort(dim=1, stable=True)[:, dropped:]
 
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
         """Apply the stages in place to (N, K, 3, H, W) frames, whose indices in their stacks are `kept` (N, K)."""
