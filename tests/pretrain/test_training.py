@@ -9,7 +9,7 @@ import torch
 from baselines.curl import CURL
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
-from pretrain.train import Trainer, build_objective, build_target, make_batches, make_objective, view_of
+from pretrain.train import Trainer, build_objective, build_target, make_batches, make_objective
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
@@ -57,11 +57,16 @@ SHARED = {"acro": "observation", "driml": "observation", "homer": "observation",
 
 def test_random_shift_is_shared_as_the_method_declares(tmp_path):
     """One bright pixel reveals the shift; methods that shift images themselves receive unshifted ones."""
-    dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
+    dataset = open_dataset(
+        write_fake_set(tmp_path / "walker_walk" / "set", [20, 25], physics_dim=18), tmp_path / "cache"
+    )
     dataset.frames = torch.zeros_like(dataset.frames)
     dataset.frames[..., 40, 40] = 255
-    for method, asked in (*((name, {}) for name in METHODS), ("acro", {"shift_shared": True})):
-        obs = view_of(dataset, PretrainConfig.of("smoke", method=method, **asked)).observe(torch.arange(24).view(4, 6))
+    pixels = make_objective(dataset, PretrainConfig.of("smoke", method="random"))
+    methods = [name for name, method in METHODS.items() if not method.reads_state]
+    for method, asked in (*((name, {}) for name in methods), ("acro", {"shift_shared": True})):
+        config = PretrainConfig.of("smoke", method=method, **asked)
+        obs = make_batches(dataset, config, pixels).view.observe(torch.arange(24).view(4, 6))
         places = obs[:, :, 0].flatten(2).int().argmax(2)
         assert (obs.view(4, 6, 9, -1).int().argmax(3) == places[..., None]).all(), "one shift per observation"
         shared = "window" if asked else SHARED.get(method, "window")
