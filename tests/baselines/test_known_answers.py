@@ -183,31 +183,6 @@ def test_driml_scores_are_clipped_and_negatives_are_all_others():
     assert objective.loss(window, 0.0)[0].item() == pytest.approx(expected), "rows of the same window are negatives"
 
 
-def test_driml_local_features_are_map_positions():
-    torch.manual_seed(0)
-    objective = DRIML(Encoder(EncoderConfig(1, "nature", 8)), None, DRIMLOptions(1), 0)
-    obs = torch.randint(0, 256, (2, 3, 9, 84, 84), dtype=torch.uint8)
-    maps = objective.encoder.frame.maps(obs)
-    places = objective._places(maps)
-    assert places.shape == (2, 3, 49, 64)
-    torch.testing.assert_close(places[1, 2, 10], maps[1, 2, :, 1, 3])
-
-
-def test_curl_momentum_encoder_moves_slowly_without_gradient():
-    objective = CURL(encoder(), None, Options(), 0)
-    window, _ = finite_windows(8, 3, 0.0, torch.Generator().manual_seed(0))
-    objective.loss(window, 0.0)[0].backward()
-    assert all(p.grad is None for p in objective.momentum_encoder.parameters())
-    assert objective.bilinear.grad.abs().sum() > 0
-    slow = [p.clone() for p in objective.momentum_encoder.parameters()]
-    with torch.no_grad():
-        for p in objective.encoder.parameters():
-            p.add_(1.0)
-    objective.after_step()
-    for before, after in zip(slow, objective.momentum_encoder.parameters(), strict=True):
-        torch.testing.assert_close(after - before, torch.full_like(before, 0.05))
-
-
 def test_curl_encodes_two_random_shifts():
     torch.manual_seed(0)
     objective = CURL(Encoder(EncoderConfig(1, "nature", 8)), None, Options(), 0)

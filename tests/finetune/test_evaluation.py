@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from finetune import evaluation
-from finetune.evaluation import EVALUATION_SEED, Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
+from finetune.evaluation import Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
 from tests.helpers_bad_input import rejection
 from tests.nn.test_encoder import CARD
 from vd4rl_pomdp.cli import main
@@ -118,25 +118,13 @@ def test_evaluation_reloads_a_changed_policy(world, agent, tmp_path):
         play(tmp_path, 0)
 
 
-def test_episodes_are_independent(world, agent, tmp_path):
-    play(tmp_path, 0, 1)
-    evaluation._environment.cache_clear()
-    play(tmp_path, 1)
-    np.testing.assert_array_equal(world[0].done[1], world[1].done[0])
-
-
-def test_episode_seeds_are_fixed(world, agent, tmp_path):
-    play(tmp_path, 0, 3)
-    assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
-    labels = {"method": "x", "task": "walker_walk"}
-    assert [row["episode_seed"] for row in episode_rows(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
-
-
 def test_return_is_the_sum_of_rewards_and_score_a_tenth(world, agent, tmp_path):
-    (episode,) = play(tmp_path, 0)
-    assert (episode.total, len(episode.rewards)) == (sum(REWARDS), LENGTH)
-    (row,) = episode_rows([episode], {"task": "walker_walk"})
-    assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
+    episodes = play(tmp_path, 0, 3)
+    assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
+    assert (episodes[0].total, len(episodes[0].rewards)) == (sum(REWARDS), LENGTH)
+    for row, number in zip(episode_rows(episodes, {"task": "walker_walk"}), (0, 3), strict=True):
+        assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
+        assert (row["episode"], row["episode_seed"]) == (number, 20_000 + number)
 
 
 def test_action_error_compares_with_actor_at_visited_states(world, agent, tmp_path):

@@ -15,7 +15,7 @@ import torch
 from finetune import end_to_end, train, trainer
 from finetune.algorithms import ALGORITHMS, bc, td3_bc
 from finetune.config import FinetuneConfig
-from finetune.features import FeatureSampler, StackedSampler
+from finetune.features import FeatureSampler, FrozenEncoder
 from finetune.histories import Histories
 from finetune.train import finetune, finetune_all
 from finetune.trainer import FinetuneTrainer
@@ -111,30 +111,6 @@ def test_seeds_option_writes_folders_equal_to_single_runs(encoder, data, tmp_pat
     assert weights[0] != weights[1]
 
 
-def test_stacked_batches_equal_single_batches(tmp_path):
-    """With datasets of different lengths, and with features that all members share."""
-    sets = [open_dataset(write_fake_set(tmp_path / name, lengths)) for name, lengths in (("a", (6, 4)), ("b", (9,)))]
-    own = [(data, torch.randn(3, data.num_rows, 5).half()) for data in (sets[0], sets[1], sets[0])]
-    for chosen in (own, [own[0]] * 3):
-        alone, members = (
-            [
-                FeatureSampler(
-                    Histories(data, NO_OPTIONS, 2, 0), features, 7, 2, 0.9,
-                    RandomStream(torch.Generator().manual_seed(seed)),
-                )
-                for seed, (data, features) in enumerate(chosen)
-            ]
-            for _ in range(2)
-        )  # fmt: skip
-        members[1].sample(), alone[1].sample()  # members may be at different positions
-        sampler = StackedSampler(members)
-        for _ in range(3):
-            batch = sampler.sample()
-            for number, single in enumerate(alone):
-                expected = single.sample()
-                assert all(torch.equal(batch[name][number], expected[name]) for name in expected)
-
-
 @stacked
 def test_stacked_runs_resume_alone_or_in_another_stack(encoder, data, tmp_path, monkeypatch):
     """A stack is cut at its second checkpoint; then one member continues alone, and the stack resumes."""
@@ -187,17 +163,32 @@ SEEDS = {"a": 0, "b": 1, "c": 2, "a alone": 0, "b alone": 1, "c alone": 2}
 
 @stacked
 def test_methods_of_equal_width_are_stacked(encoders, data, tmp_path):
-    """With and without a memory, and with different seeds and views."""
-    given = {"mik+a": {"seed": 1, "view_seed": 7}, "acro": {"seed": 2, "shift": 2, "eval_episodes": 2}}
+    """With and without a memory, and with different datasets, seeds and views."""
+    other = write_fake_set(tmp_path / "walker_walk" / "other", [9, 31])
+    given = {
+        "mik+a": (data, {"seed": 1, "view_seed": 7}),
+        "acro": (other, {"seed": 2, "shift": 2, "eval_episodes": 2}),
+    }
     for folder in ("stacked", "alone"):
         configs = [
-            smoke_finetune(encoders[method], data, tmp_path / folder / method, **(BRIEF | more))
-            for method, more in given.items()
+            smoke_finetune(encoders[method], own, tmp_path / folder / method, **(BRIEF | more))
+            for method, (own, more) in given.items()
         ]
         for some in [configs] if folder == "stacked" else [[config] for config in configs]:
             finetune_all(some)
     for method in given:
         same_but_for_rounding(tmp_path / "stacked" / method, tmp_path / "alone" / method)
+
+
+@stacked
+def test_stack_with_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypatch):
+    encode, encoded = FrozenEncoder.frames, []
+    monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
+    own = [{"seed": seed, "view_seed": 8} | BRIEF for seed in (0, 1)]
+    finetune_all([smoke_finetune(encoder, data, tmp_path / f"{number}", **own[number]) for number in (0, 1)])
+    assert len(encoded) == 3, "one call per episode"
+    finetune(smoke_finetune(encoder, data, tmp_path / "alone", **own[1]))
+    same_but_for_rounding(tmp_path / "1", tmp_path / "alone")
 
 
 @stacked

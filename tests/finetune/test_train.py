@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from finetune import train, trainer
+from finetune import trainer
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FrozenEncoder
 from finetune.train import finetune as run_finetune
@@ -73,15 +73,6 @@ def test_view_seed_fixes_features_but_not_networks(encoder, data, tmp_path):
     assert not torch.equal(other["net.0.weight"], plain["net.0.weight"])
 
 
-def test_stack_with_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypatch):
-    encode, encoded = FrozenEncoder.frames, []
-    monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
-    configs = [smoke_finetune(encoder, data, tmp_path / f"seed{n}", seed=n, view_seed=7, **BRIEF) for n in (0, 1)]
-    runs = train.finetune_all(configs)
-    assert len(encoded) == 3, "one call per episode"
-    assert all(run.finished and not (run.path / "features.npy").exists() for run in runs)
-
-
 @pytest.fixture
 def with_states(tmp_path) -> Path:
     return write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
@@ -104,7 +95,7 @@ def test_end_to_end_and_state_encoders_resume_bit_exactly(with_states, tmp_path,
     assert (critic["value"] != 0, critic["moved"]) == (True, None), "two rows of metrics are too few for a slope"
 
 
-def test_state_encoder_reads_pose_and_velocity(with_states, data, tmp_path):
+def test_state_encoder_reads_pose_and_velocity(with_states, tmp_path):
     encoder, _ = load_encoder(
         run_pretrain(smoke_pretrain(with_states, tmp_path / "s", method="state")).path / "encoder"
     )
@@ -116,10 +107,6 @@ def test_state_encoder_reads_pose_and_velocity(with_states, data, tmp_path):
     hinges, angle = np.delete(dataset.physics[rows], [1, 2], axis=1), dataset.physics[rows, 2:3]
     expected = np.concatenate([hinges[:, :7], np.sin(angle), np.cos(angle), hinges[:, 7:]], axis=1)
     np.testing.assert_allclose(z, expected, atol=1e-6)
-    with pytest.raises(UserError, match="stores no simulator states"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "none", method="state"))
-    with pytest.raises(UserError, match="drq_bc has no memory"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
 def test_unfit_datasets_and_missing_gpus_leave_no_run(encoder, data, tmp_path):
