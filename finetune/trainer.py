@@ -74,32 +74,6 @@ STANDARDISED_BY = 1024
 """Minimum transitions for estimating feature means and standard deviations without cached features (`--views 0`)."""
 
 
-@torch.no_grad()
-def path_error(
-    dataset: Dataset,
-    actor: Actor,
-    encode: Callable[[int], torch.Tensor],
-    policy: Callable[[torch.Tensor], torch.Tensor],
-) -> float:
-    """Mean squared difference between a policy and the behaviour policy's mean action, on the data's own states.
-
-    Over all decisions of at most PATH_EPISODES episodes. `encode` gives an episode's representations (rows, D).
-    """
-    assert dataset.task is not None
-    assert dataset.physics is not None
-    task = TASKS.named(dataset.task)
-    assert isinstance(task, DMCTask), "other tasks store no states"
-    deciding = np.flatnonzero((dataset.episode_end - dataset.episode_start).cpu().numpy() > 1)
-    last = len(deciding) - 1
-    errors = []
-    for number in deciding[np.unique(np.linspace(0, last, min(last + 1, PATH_EPISODES)).astype(int))].tolist():
-        physics = dataset.physics[dataset.rows_of(number)][:-1]  # no decision at an episode's last row
-        behaviour = np.array([actor.act(state) for state in observed_states(task, physics)])
-        actions = policy(encode(number)[:-1]).cpu().numpy()
-        errors.append(np.square(actions - behaviour.reshape(actions.shape)).mean(1))
-    return float(np.concatenate(errors).mean())
-
-
 class FinetuneTrainer:
     """One run: its inputs; once built, its algorithm and batches; and its results."""
 
@@ -289,3 +263,29 @@ class FinetuneTrainer:
         self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
+
+
+@torch.no_grad()
+def path_error(
+    dataset: Dataset,
+    actor: Actor,
+    encode: Callable[[int], torch.Tensor],
+    policy: Callable[[torch.Tensor], torch.Tensor],
+) -> float:
+    """Mean squared difference between a policy and the behaviour policy's mean action, on the data's own states.
+
+    Over all decisions of at most PATH_EPISODES episodes. `encode` gives an episode's representations (rows, D).
+    """
+    assert dataset.task is not None
+    assert dataset.physics is not None
+    task = TASKS.named(dataset.task)
+    assert isinstance(task, DMCTask), "other tasks store no states"
+    deciding = np.flatnonzero((dataset.episode_end - dataset.episode_start).cpu().numpy() > 1)
+    last = len(deciding) - 1
+    errors = []
+    for number in deciding[np.unique(np.linspace(0, last, min(last + 1, PATH_EPISODES)).astype(int))].tolist():
+        physics = dataset.physics[dataset.rows_of(number)][:-1]  # no decision at an episode's last row
+        behaviour = np.array([actor.act(state) for state in observed_states(task, physics)])
+        actions = policy(encode(number)[:-1]).cpu().numpy()
+        errors.append(np.square(actions - behaviour.reshape(actions.shape)).mean(1))
+    return float(np.concatenate(errors).mean())

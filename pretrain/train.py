@@ -89,30 +89,6 @@ class Trainer:
         self._replay = Replay(self._update, self.device, [batches.draws], trained=[objective, self.optimiser])
         self._progress: float | Tensor = torch.zeros((), device=self.device) if self._replay.replays else 0.0
 
-    def update(self) -> dict[str, Tensor]:
-        """Take one gradient step; returns the objective's scalars to log."""
-        progress = self.step / max(1, self.config.steps)
-        if isinstance(self._progress, Tensor):
-            self._progress.fill_(progress)  # in place: a captured CUDA graph reads this tensor
-        else:
-            self._progress = progress
-        if self._learning_rate is not None:
-            set_learning_rate(self.optimiser, self._learning_rate(self.step))
-        logs = self._replay(0)
-        self.step += 1
-        return logs
-
-    def _update(self, turn: int) -> dict[str, Tensor]:
-        window = self.batches.sample()
-        with autocast(self.device, self.config.precision):
-            loss, logs = self.objective.loss(window, self._progress)
-        # outside autocast, which is meant for the forward pass only
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimiser.step()
-        self.objective.after_step()
-        return logs
-
     def run(
         self,
         run: RunFolder,
@@ -138,6 +114,30 @@ class Trainer:
                 if loop.due(self.config.log_every) or step == also_at:
                     loop.log("loss", **measures())
             loop.require_finite(self.objective)  # no later loss would show that the last step diverged
+
+    def update(self) -> dict[str, Tensor]:
+        """Take one gradient step; returns the objective's scalars to log."""
+        progress = self.step / max(1, self.config.steps)
+        if isinstance(self._progress, Tensor):
+            self._progress.fill_(progress)  # in place: a captured CUDA graph reads this tensor
+        else:
+            self._progress = progress
+        if self._learning_rate is not None:
+            set_learning_rate(self.optimiser, self._learning_rate(self.step))
+        logs = self._replay(0)
+        self.step += 1
+        return logs
+
+    def _update(self, turn: int) -> dict[str, Tensor]:
+        window = self.batches.sample()
+        with autocast(self.device, self.config.precision):
+            loss, logs = self.objective.loss(window, self._progress)
+        # outside autocast, which is meant for the forward pass only
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimiser.step()
+        self.objective.after_step()
+        return logs
 
     def state(self) -> dict[str, Any]:
         return {

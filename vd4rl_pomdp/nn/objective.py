@@ -116,38 +116,6 @@ class InverseObjective(Objective):
             Indices j of the visible observations o_j, and of the visible actions a_j.
         """
 
-    def visible_frames(self, t: int, k: int, rows: int) -> set[int]:
-        """Like `visible`, as single frames: frame j is the newest of o_j. By default all frames of the visible stacks,
-        for stacks of 3 and rows {0, 1}: {-2, -1, 0, 1}; negative ones precede the window."""
-        return {j - older for j in self.visible(t, k, rows)[0] for older in range(self.encoder.frame_stack)}
-
-    def past_visible(self, t: int) -> tuple[set[int], set[int]]:
-        """Indices of the observations and actions that the encoder's state at row t depends on."""
-        shape, memory = self.encoder.config, self.encoder.memory
-        if memory is None:
-            return {t}, set()
-        window, reach = shape.history_window or t + 1, memory.reach or t + 1
-        # a window's first row has no previous action; the first row within a memory's reach does
-        actions = range(max(0, t + 1 - window, t - reach), t) if shape.use_actions else ()
-        seen = range(max(0, t + 1 - window, t + 1 - reach), t + 1)
-        return set(seen[:1] if memory.first_only else seen), set(actions)
-
-    def pairs(self, rows: int) -> Tensor:
-        """The (t, k) scored in a window of `rows` rows: (P, 2) int64 on the CPU; cached, do not modify."""
-        return all_pairs(rows, self.options.largest_gap)
-
-    def _scored(self, rows: int, device: torch.device) -> tuple[Tensor, list[int]]:
-        """`pairs` on a device, and their sorted distinct k; cached, because CUDA graphs cannot copy from the host."""
-        if (rows, device) not in self._pairs:
-            pairs = self.pairs(rows)
-            self._pairs[rows, device] = pairs.to(device), sorted(set(pairs[:, 1].tolist()))
-        return self._pairs[rows, device]
-
-    def action_logits(self, window: Windows) -> Tensor:
-        """Action head outputs for every pair: (B, P, target.outputs)."""
-        past, future = self.representations(window)
-        return self.head(past, future, self._scored(window.obs.shape[1], past.device)[0])
-
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real (unpadded) pairs plus the optional terms; logs `loss_kNN`, the mean per k."""
         past, future = self.representations(window)
@@ -176,6 +144,38 @@ class InverseObjective(Objective):
             total, logs["l2_states"] = total + self.options.l2_states * (1 - progress) * term, term.detach()
         logs["loss"] = total.detach()
         return total, logs
+
+    def pairs(self, rows: int) -> Tensor:
+        """The (t, k) scored in a window of `rows` rows: (P, 2) int64 on the CPU; cached, do not modify."""
+        return all_pairs(rows, self.options.largest_gap)
+
+    def _scored(self, rows: int, device: torch.device) -> tuple[Tensor, list[int]]:
+        """`pairs` on a device, and their sorted distinct k; cached, because CUDA graphs cannot copy from the host."""
+        if (rows, device) not in self._pairs:
+            pairs = self.pairs(rows)
+            self._pairs[rows, device] = pairs.to(device), sorted(set(pairs[:, 1].tolist()))
+        return self._pairs[rows, device]
+
+    def action_logits(self, window: Windows) -> Tensor:
+        """Action head outputs for every pair: (B, P, target.outputs)."""
+        past, future = self.representations(window)
+        return self.head(past, future, self._scored(window.obs.shape[1], past.device)[0])
+
+    def visible_frames(self, t: int, k: int, rows: int) -> set[int]:
+        """Like `visible`, as single frames: frame j is the newest of o_j. By default all frames of the visible stacks,
+        for stacks of 3 and rows {0, 1}: {-2, -1, 0, 1}; negative ones precede the window."""
+        return {j - older for j in self.visible(t, k, rows)[0] for older in range(self.encoder.frame_stack)}
+
+    def past_visible(self, t: int) -> tuple[set[int], set[int]]:
+        """Indices of the observations and actions that the encoder's state at row t depends on."""
+        shape, memory = self.encoder.config, self.encoder.memory
+        if memory is None:
+            return {t}, set()
+        window, reach = shape.history_window or t + 1, memory.reach or t + 1
+        # a window's first row has no previous action; the first row within a memory's reach does
+        actions = range(max(0, t + 1 - window, t - reach), t) if shape.use_actions else ()
+        seen = range(max(0, t + 1 - window, t + 1 - reach), t + 1)
+        return set(seen[:1] if memory.first_only else seen), set(actions)
 
 
 class StateInverse(InverseObjective):
