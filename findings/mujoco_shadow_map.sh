@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # One would guess: an 84-pixel frame costs less than a 168-pixel one, and `physics.model.vis.quality` can be lowered to
 # speed up frames at any time.
-# What happens, without a GPU: at least two fifths of a small frame's time go to the shadow map, whose 2048 x 2048 pixels
-# do not follow the frame's size: four times the pixels cost only a sixth more. A map of 512 saves these two fifths and
+# What happens, without a GPU: at least two fifths of a small frame's time go to the shadow map, whose 2048 x 2048
+# pixels do not follow the frame's size: four times the pixels cost only a sixth more. A map of 512 saves these two fifths and
 # changes the frame by a hundredth of one of 255; but its size is read when the first frame is drawn, and later changes
 # are ignored without an error.
 # For this field: rendering dominates the evaluation of pixel policies on CPUs. Set it before `env.reset()`.
