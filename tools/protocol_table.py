@@ -8,7 +8,7 @@ import numpy as np
 from offline_table import CLEAN, mean_text
 
 from vd4rl_pomdp.core.text import table_lines
-from vd4rl_pomdp.report.gates import EXPLORATORY, episodes_of, gates, judge_claims, unranked
+from vd4rl_pomdp.report.gates import EXPLORATORY, PRIMARY, UNJUDGED, episodes_of, gates, judge_claims, unranked
 from vd4rl_pomdp.report.load import PROBES, Run, label
 from vd4rl_pomdp.report.stats import number, with_interval
 from vd4rl_pomdp.runs.files import groups
@@ -22,11 +22,15 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
         for name, mine in sorted(by_method.items(), key=lambda item: -episodes_of(item[1]).mean()):
             clean = number(None) if place[2] == CLEAN else mean_text(episodes_of(mine, clean=True))
             probes = ", ".join(f"{np.mean([run.measures[probe] for run in mine]):.0f}" for probe in PROBES)
-            moved = 100 * np.max(np.array([run.measures["critic_moved"] for run in mine], dtype=float))
+            moved = 100 * np.max(np.abs(np.array([run.measures["critic_moved"] for run in mine], dtype=float)))
             cells = mean_text(episodes_of(mine)), clean, probes, f"{moved:.2f}%"
             rows.append((", ".join(place), f"`{name}`", len(mine), *cells))
     head = ("setting", "method", "n", "return", "evaluated clean", "probe: pose, velocity", "critic moved at most")
     return table_lines(head, rows, (0, 1))
+
+
+LEAST_SEEDS = 4
+"""Seeds of both methods of a primary contrast, of five, without which it is not judged."""
 
 
 def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
@@ -40,8 +44,10 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
         )
         setting = ", ".join(row[name] for name in ("task", "quality", "corruption"))
         sides = f"`{row['left']}` minus `{row['right']}`"
-        seeds = f"{row['left_seeds']}, {row['right_seeds']}"
-        tested = (number(row["adjusted_p"], 3), number(row["smallest"], 0), row["verdict"])
-        rows.append((setting, sides, seeds, found, clean, *tested))
+        seeds = row["left_seeds"], row["right_seeds"]
+        few = row["family"] == PRIMARY and min(seeds) < LEAST_SEEDS
+        verdict = f"{UNJUDGED}missing seeds" if few else row["verdict"]
+        tested = (number(row["adjusted_p"], 3), number(row["smallest"], 0), verdict)
+        rows.append((setting, sides, ", ".join(map(str, seeds)), found, clean, *tested))
     head = ("setting", "contrast", "n", "difference", "evaluated clean", "p (Holm)", "detectable", "verdict")
     return table_lines(head, rows, (0, 1, 7))

@@ -70,9 +70,10 @@ def test_best_method_needs_two_seeds(tmp_path):
     assert (row["verdict"], row["above_random"]) == ("discriminates", pytest.approx(520 - 120))
 
 
-def test_gate_references_exclude_variants(tmp_path):
+def test_gates_exclude_variants(tmp_path):
     grid(tmp_path, GOOD | {("state", "patch"): ()})
     grid(tmp_path, {("state", "patch"): (75, 77)}, pose_noise=34)
+    grid(tmp_path, {("mik", "patch"): (90, 92)}, history="lru")
     row = patch_gate(grid(tmp_path, {("random", "patch"): (49,)}, history="gru"))
     assert row["verdict"] == "not known to discriminate: state was not measured"
     assert (row["above_random"], row["low"]) == pytest.approx((520 - 120, ABOVE_RANDOM[0]))

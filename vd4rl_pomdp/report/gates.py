@@ -76,7 +76,7 @@ def gates(runs: list[Run]) -> list[Row]:
 def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
     here, clean = (seen_under(under, runs) for under in (key[2], "none"))
     state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
-    learned, floor = [run for run in here if run.method not in REFERENCES], as_it_is("random", here)
+    learned, floor = judged(run for run in here if run.method not in REFERENCES), as_it_is("random", here)
     above, (low, high) = difference(compared := sides(learned, floor))
     data = {value for run in here if (value := run.reference.data_return) is not None}
     everyone = {"state": state, "acro under none": acro, "best": compared.left, "random": compared.right}
@@ -180,6 +180,13 @@ def as_it_is(method: str, runs: Iterable[Run], history: str = "method") -> list[
     """Runs of a method without variants other than its history. Unrecorded settings count as plain."""
     plain, mine = (load.PLAIN | {"history": history}).items(), [run for run in runs if run.method == method]
     return [run for run in mine if all(run.settings.get(name, load.PLAIN[name]) == value for name, value in plain)]
+
+
+def judged(runs: Iterable[Run]) -> list[Run]:
+    """Runs without variants other than `acro` with a GRU: the more variants compete, the higher the best one by chance."""
+    every = list(runs)
+    plain = [run for method in dict.fromkeys(run.method for run in every) for run in as_it_is(method, every)]
+    return plain + as_it_is("acro", every, "gru")
 
 
 def best_of(runs: Iterable[Run]) -> list[Run]:
@@ -323,7 +330,7 @@ def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tu
     alike, chosen = on_set(place, runs), []
     for side, other in ((claim.left, claim.right), (claim.right, claim.left)):
         seen = seen_under("none" if side.clean else place[2], alike)
-        others = [run for run in seen if run.method not in (other.method, *REFERENCES)]
+        others = judged(run for run in seen if run.method not in (other.method, *REFERENCES))
         chosen.append(as_it_is(side.method, seen, side.history) if side.method else others)
     compared = sides(*chosen) if claim.right.method else _decisive(*chosen)
     if not compared.left:
@@ -348,7 +355,7 @@ def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tu
 def _decisive(left: list[Run], others: list[Run]) -> Sides:
     """The comparison that decides a claim about every other method, since it must hold against each of them.
 
-    Among other methods and variants: the one with the highest return of those that refute the claim, else of those that
+    Among other methods: the one with the highest return of those that refute the claim, else of those that
     leave it open, however few seeds they have.
     """
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
