@@ -151,9 +151,10 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, cached
                     for episodes in frozen.groups():
                         random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
                         progress.advance(len(episodes))
-            with replacing_file(cached) as fresh, fresh.open("wb") as file:
-                np.save(file, features.cpu().numpy())
         _ENCODED[key] = features
+    if not cached.exists():  # also where trainings share features: each resumes by itself
+        with replacing_file(cached) as fresh, fresh.open("wb") as file:
+            np.save(file, features.cpu().numpy())
     return features
 
 

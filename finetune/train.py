@@ -188,15 +188,16 @@ def train(trainers: Sequence[FinetuneTrainer]) -> None:
             updates = []
             for members in [group] if stacks_on(group[0].device) else [[one] for one in group]:
                 shared = Updates([one.algorithm for one in members], [one.sampler for one in members], settings)
-                updates.append(shared)
+                updates.append((members, shared))
                 for number, one in enumerate(members):
                     one.settle = partial(shared.settle, number)
             for step in in_step(loops := [one.loop for one in group], until):
-                logs = [own for shared in updates for own in shared(step - 1)]
-                for one, own in zip(group, logs, strict=True):
-                    if one in left:
-                        one.loop.add(own)
-                        one.step = step
+                for members, shared in updates:
+                    if any(one in left for one in members):
+                        for one, logs in zip(members, shared(step - 1), strict=True):
+                            if one in left:
+                                one.loop.add(logs)
+                                one.step = step
                 if loops[0].due(settings.log_every):
                     each(lambda one: one.loop.log(), group)
                 if loops[0].due(settings.eval_every):

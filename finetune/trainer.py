@@ -22,7 +22,7 @@ from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
 from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from vd4rl_pomdp.core.errors import refuse_outside
-from vd4rl_pomdp.core.hardware import pick_device
+from vd4rl_pomdp.core.hardware import pick_device, warn_of_busy_cores
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.streams import random_stream, seed_networks
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY, DMCTask
@@ -182,6 +182,8 @@ class FinetuneTrainer:
     def begin(self, title: str) -> AbstractContextManager[Loop]:
         """Open the training loop, resuming from the newest checkpoint. No progress is shown without a title."""
         self.reference.write(self.run.path)
+        if self.card.end_to_end:
+            warn_of_busy_cores(self.device)
         total, card = self.config.updates, asdict(self.card)
         return training(self.run, self, title, total, "updates", labels=self.labels, card=card)
 

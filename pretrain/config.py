@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from pretrain.objectives import METHODS, Method
-from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, flag_of, refuse_outside, refuse_unknown
 from vd4rl_pomdp.core.hardware import Precision
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
@@ -132,6 +132,12 @@ class PretrainConfig(TrainingConfig):
         super().check()
         method = METHODS.named(self.method)
         refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
+        usual = self.defaults(self.preset)
+        for name in ("frame_encoder", "shift") if method.reads_state else ("shift",) if method.shift == "own" else ():
+            if getattr(self, name) != usual[name]:
+                raise UserError(f"{flag_of(name)} is not read by the method {self.method}: leave it out")
+        if method.histories and getattr(self.memory, "m", None) is not None:
+            raise UserError(f"--m is not for {self.method}, which trains on whole histories: leave it out")
         if self.batch_size < method.least_batch:
             why = f"{self.method} contrasts windows: give it {method.least_batch}"
             raise UserError(f"--batch-size is {self.batch_size}; {why}")

@@ -201,6 +201,15 @@ def test_invalid_listing_is_rejected(hub, encoder, tmp_path, change):
     assert not (tmp_path / "new").exists()
 
 
+def test_dataset_with_other_files_is_rejected(hub, data, tmp_path):
+    push(data, SET)
+    listing = json.loads(hub.files(WHERE[SET])[LISTING])
+    listing["sha256"]["notes.txt"] = ""
+    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {LISTING: json.dumps(listing).encode()})
+    with pytest.raises(UserError, match=r"lab/set: its vd4rl_pomdp\.json is of another version or damaged"):
+        pull(SET, tmp_path / "new")
+
+
 def test_damaged_download_is_fetched_again(hub, encoder, tmp_path):
     push(encoder, ENCODER)
     hub.damaged.add("model.safetensors")

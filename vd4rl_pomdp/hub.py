@@ -47,7 +47,10 @@ ENCODER, AGENT, SET = "an encoder", "an agent", "a data set"
 _FORMAT = 1
 _FILES = {ENCODER: (CONFIG, WEIGHTS), AGENT: (*agents.FILES, agents.CARD)}
 _MODEL = [name for names in _FILES.values() for name in names]
-_PATTERNS = {ENCODER: _MODEL, AGENT: _MODEL, SET: ["*.hdf5", "*.HDF5", "*.h5", "*.H5", "*.json", "*.md", "*.png"]}
+_BESIDE_SHARDS = (".json", ".md", ".png")
+"""Suffixes of a dataset's other files."""
+_SHARDS = ["*.hdf5", "*.HDF5", "*.h5", "*.H5"]
+_PATTERNS = {ENCODER: _MODEL, AGENT: _MODEL, SET: [*_SHARDS, *(f"*{suffix}" for suffix in _BESIDE_SHARDS)]}
 """Files of each kind: a push replaces all of these and leaves the repository's other files alone."""
 
 
@@ -169,6 +172,7 @@ def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str
     files = found if isinstance(found := listing.get("sha256"), dict) else {}
     kind = AGENT if (kind, listing.get("kind")) == (ENCODER, AGENT) else kind
     plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in files)
+    plain = plain and all(is_shard_name(name) or Path(name).suffix in _BESIDE_SHARDS for name in files)
     fits = files.keys() == set(_FILES[kind]) if kind in _FILES else plain and any(map(is_shard_name, files))
     if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not fits:
         raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner")
@@ -186,7 +190,7 @@ def _checked(folder: Path, kind: str) -> list[Path]:
         (load_encoder if kind == ENCODER else agents.load_agent)(folder)
         return [folder / name for name in _FILES[kind]]
     shards = read_set(folder).shards
-    kept = [p for p in folder.iterdir() if p.suffix in (".json", ".md", ".png") and not p.name.startswith(".")]
+    kept = [p for p in folder.iterdir() if p.suffix in _BESIDE_SHARDS and not p.name.startswith(".")]
     return sorted([*shards, *(path for path in kept if path.name not in (CARD, LISTING))])
 
 

@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.helpers_bad_input import rejection
 from tests.helpers_data import fake_reward, write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.check import check_dataset
@@ -62,6 +63,7 @@ def test_check_reports_largest_replay_error(folder, tmp_path):
 def test_nan_replay_is_reported_as_nan(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(dmc, "replay_rewards", lambda *arguments: true_replay(*arguments) * np.nan)
     assert np.isnan(check_dataset(folder, tmp_path / "cache")["replay_max_error"])
+    assert "does not give the stored values (largest difference nan" in rejection(["data", "check", str(folder)])
 
 
 @pytest.mark.parametrize(

@@ -214,13 +214,15 @@ def test_attributes_other_than_json_object_are_rejected(shard, stored):
         read_attributes(shard)
 
 
-@pytest.mark.parametrize("kind", ["link", "storage", "virtual"])
+@pytest.mark.parametrize("kind", ["link", "links", "storage", "virtual"])
 def test_arrays_in_other_files_are_rejected(shard, tmp_path, kind):
     with h5py.File(shard, "a") as file, h5py.File(tmp_path / "other.h5", "w") as other:
         value = file.pop("reward")[()]
         other["reward"] = value
         if kind == "link":
             file["reward"] = h5py.ExternalLink(other.filename, "reward")
+        elif kind == "links":
+            file["far"], file["reward"] = h5py.ExternalLink(other.filename, "reward"), h5py.SoftLink("/far")
         elif kind == "storage":
             value.tofile(tmp_path / "other.bin")
             file.create_dataset(

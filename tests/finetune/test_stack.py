@@ -187,6 +187,9 @@ def test_stack_with_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypa
     own = [{"seed": seed, "view_seed": 8} | BRIEF for seed in (0, 1)]
     finetune_all([smoke_finetune(encoder, data, tmp_path / f"{number}", **own[number]) for number in (0, 1)])
     assert len(encoded) == 3, "one call per episode"
+    cut = [smoke_finetune(encoder, data, tmp_path / f"cut{number}", **own[number]) for number in (0, 1)]
+    run_until_cut(monkeypatch, 2, finetune_all, cut)
+    assert all((tmp_path / f"cut{number}" / "features.npy").exists() for number in (0, 1)), "each resumes by itself"
     finetune(smoke_finetune(encoder, data, tmp_path / "alone", **own[1]))
     same_but_for_rounding(tmp_path / "1", tmp_path / "alone")
 

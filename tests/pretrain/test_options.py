@@ -103,6 +103,10 @@ def test_max_k_beyond_the_window_is_rejected(max_k, window):
         ({"method": "mik", "history": "none"}, "unknown --history 'none': choose one of method, gru"),
         ({"method": "bc", "history": "gru"}, "bc has no memory"),
         ({"method": "integrator", "history": "gru"}, "integrator implies its memory"),
+        ({"method": "integrator", "m": 2}, "--m is not for integrator, which trains on whole histories"),
+        ({"method": "curl", "shift": 0}, "--shift is not read by the method curl"),
+        ({"method": "state", "shift": 2}, "--shift is not read by the method state"),
+        ({"method": "state", "frame_encoder": "drq"}, "--frame-encoder is not read by the method state"),
     ],
 )
 def test_invalid_option_values_are_rejected(settings, message):

@@ -1,5 +1,6 @@
 """Commands neither overwrite nor write into a run, policy, encoder or dataset, or a folder in use."""
 
+import errno
 import hashlib
 import json
 import os
@@ -165,3 +166,37 @@ def test_built_folder_appears_complete_and_keeps_hidden_files(tmp_path):
     with pytest.raises(UserError, match="no"):
         fail()
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_built_folder_may_be_a_link_and_loses_no_hidden_file(tmp_path, monkeypatch):
+    out = fill(tmp_path / "out", __DS_Store="of a file manager")
+    (tmp_path / "link").symlink_to(out)
+    rename = Path.rename
+
+    def broken(self: Path, target: Path) -> Path:
+        if self.name == "new":
+            raise OSError(errno.EIO, "Input/output error")
+        return rename(self, target)
+
+    def build() -> None:
+        with built(tmp_path / "link") as made:
+            fill(made, a="1")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", broken)
+        with pytest.raises(UserError, match="input/output error"):
+            build()
+    assert [path.name for path in out.iterdir()] == [".DS_Store"]
+    build()
+    assert sorted(path.name for path in out.iterdir()) == [".DS_Store", "a"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "out"]
+    fill(tmp_path / "busy")
+
+    def fill_meanwhile() -> None:
+        with built(tmp_path / "busy") as made:
+            fill(made, a="1")
+            (tmp_path / "busy" / "b").write_text("2")
+
+    with pytest.raises(UserError, match="busy: is no longer empty"):
+        fill_meanwhile()
+    assert [path.name for path in (tmp_path / "busy").iterdir()] == ["b"]

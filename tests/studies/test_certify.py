@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_data import fake_rows
+from tests.helpers_data import fake_rows, write_fake_set
 from tests.helpers_report import describe, without_figures, write_run
 from tests.helpers_stages import contents
 from vd4rl_pomdp.cli import main, studies
@@ -105,6 +105,16 @@ def test_certificate_is_computed_stored_and_shown(states, executed, tmp_path, mo
     main(["report", "compare", str(tmp_path / "kept"), str(out), "--out", str(tmp_path / "both")])
     assert line in " ".join(capsys.readouterr().out.split())
     assert line.replace("memory", "Memory") in unescape((tmp_path / "both" / "index.html").read_text())
+
+
+def test_runs_on_another_dataset_do_not_count(states, executed, tmp_path, capsys):
+    words = ["patch", "--out", str(tmp_path / "certified"), "--change", *SMALL.split()]
+    main(["certify", str(states), *words])
+    other = write_fake_set(tmp_path / "walker_walk" / "medium", [9] * 10, physics_dim=18)
+    with pytest.raises(SystemExit):
+        main(["certify", str(other), *words])
+    assert "the content of --data" in capsys.readouterr().err
+    assert not (other / "certificates.json").exists()
 
 
 def test_missing_certificate_is_reported(tmp_path, monkeypatch, capsys):

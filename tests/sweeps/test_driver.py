@@ -18,7 +18,7 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import TEMPORARY, DiskFullError, UserError
 from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver
-from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished
+from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished, lost_among
 from vd4rl_pomdp.sweeps.options import JOB_VARIABLE, LocalOptions
 
 
@@ -186,6 +186,13 @@ def test_joined_driver_ends_when_no_job_can_start(tmp_path):
     (tmp_path / "go").touch()
     assert code(process) == 0
     assert [len(begun(one)) for one in jobs] == [1, 1]
+
+
+def test_failure_is_known_before_the_jobs_that_need_it_in_any_order(tmp_path):
+    """Plans of two grids may list a policy before its encoder."""
+    jobs = [job(tmp_path, "last", "after"), job(tmp_path, "after", "one"), job(tmp_path, "one", ends=(1,))]
+    assert not sweep(tmp_path, *jobs)
+    assert lost_among(jobs, SweepFolder(tmp_path).attempts(jobs)) == {"one", "after", "last"}
 
 
 def test_drivers_pause_after_temporary_failures(tmp_path, monkeypatch):

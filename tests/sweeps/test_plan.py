@@ -387,6 +387,15 @@ def test_user_defined_quality_is_used_if_present(tmp_path, capsys, own_cache, qu
     assert GridMembers("grid", cells).among([run]) == [run]
 
 
+def test_two_datasets_of_one_name_are_rejected(tmp_path):
+    """A shared preset decides a maze dataset's size, its folder's name does not show it."""
+    blocks = "".join(f'[[block]]\npreset = "{preset}"\n' for preset in ("smoke", "cpu"))
+    maze = '[navigation_collect]\nmaze = "no_curtain"\n[navigation_train]\nmethod = "acro"\n'
+    (tmp_path / "grid.toml").write_text(maze + blocks)
+    with pytest.raises(UserError, match="no_curtain: the grid asks for trajectories 10 and 100 in one dataset: set"):
+        plan(tmp_path)
+
+
 def test_dataset_of_another_task_is_rejected(tmp_path):
     (tmp_path / "grid.toml").write_text(GRID)
     write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25])

@@ -140,7 +140,7 @@ def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
     result = checking.check_dataset(set)
     show(result, json)
     error = result["replay_max_error"]
-    if error is not None and error > REPLAY_TOLERANCE:
+    if error is not None and not error <= REPLAY_TOLERANCE:  # also NaN
         raise UserError(
             f"{set}: replaying the stored actions does not give the stored values (largest difference {error}, "
             f"tolerance {REPLAY_TOLERANCE})"

@@ -42,7 +42,7 @@ _RUNNING = Path("/proc/loadavg")
 
 
 def warn_of_busy_cores(device: torch.device) -> None:
-    """Warn before training with several threads while other programs use half of the cores or more.
+    """Warn before convolutions are trained with several threads while other programs use half of the cores or more.
 
     In backward convolutions, oneDNN's threads spin until all of them arrive, whatever OpenMP's wait policy: on two
     cores, two pretrainings with two threads each took 47 times as long as one.
@@ -50,6 +50,8 @@ def warn_of_busy_cores(device: torch.device) -> None:
     threads = torch.get_num_threads()
     if device.type != "cpu" or threads == 1 or not _RUNNING.exists():
         return
+    if len(os.sched_getaffinity(0)) < (os.cpu_count() or 1):
+        return  # the running threads may be on other cores
     counts = []
     for _ in range(5):  # the smallest of several, since programs wake for a moment
         counts.append(int(_RUNNING.read_text(encoding="ascii").split()[3].partition("/")[0]) - 1)

@@ -26,7 +26,6 @@ from vd4rl_pomdp.data.formats.base import SourceSet
 from vd4rl_pomdp.data.formats.vd4rl import read_shards
 from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
-from vd4rl_pomdp.runs.files import holds_anything
 from vd4rl_pomdp.runs.outputs import built, refuse_inside, removing_if_empty
 from vd4rl_pomdp.runs.progress import ProgressLine
 
@@ -87,12 +86,11 @@ def import_set(
         for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
-    new = not holds_anything(out)
     with removing_if_empty(out):
         try:
             collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
         except UserError:
-            if new and not any(shard.path.exists() for shard in shards):
+            if episodes.called and not any(shard.path.exists() for shard in shards):
                 (out / PLAN).unlink(missing_ok=True)
             raise
     _print(episodes.notes())
@@ -143,8 +141,11 @@ class _Reader:
         self._layout: dict[str, tuple[int, ...]] = {}
         self._last = np.zeros(0, np.uint8)  # last image of the previous episode
         self._clipped = self._read = self._still = self._joined = 0
+        self.called = False
+        """Whether this process imports, not another one that owns the folder."""
 
     def __call__(self, number: int) -> EpisodeArrays:
+        self.called = True
         with _errors_of(f"{self._name}: episode {number}"):
             if number != self._next:
                 self._episodes = self._source.read(number)

@@ -183,7 +183,7 @@ def as_it_is(method: str, runs: Iterable[Run], history: str = "method") -> list[
 
 
 def judged(runs: Iterable[Run]) -> list[Run]:
-    """Runs without variants other than `acro` with a GRU: the more variants compete, the higher the best one by chance."""
+    """Runs without variants, but `acro` with a GRU: the more variants compete, the higher is the best by chance."""
     every = list(runs)
     plain = [run for method in dict.fromkeys(run.method for run in every) for run in as_it_is(method, every)]
     return plain + as_it_is("acro", every, "gru")

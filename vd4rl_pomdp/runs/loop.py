@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core.hardware import pick_device, warn_of_busy_cores
 from vd4rl_pomdp.runs import METRICS_FILE, interrupt
 from vd4rl_pomdp.runs.checkpoint import State
 from vd4rl_pomdp.runs.metrics import Means, MetricsLog, mirrors_of
@@ -120,8 +119,6 @@ def training(
         learner.restore(state["learner"])
         means.load_state_dict(state["means"])
 
-    if title:
-        warn_of_busy_cores(pick_device(run.config.get("device", "auto")))
     run.restore(restore)
     log = MetricsLog(run.path / METRICS_FILE, learner.step, mirrors_of(run, labels, card or {}))
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():

@@ -133,23 +133,29 @@ def built(out: Path) -> Iterator[Path]:
     """
     refuse_inside(out)
     refuse_no_folder(out)
-    if holds_anything(out):
-        raise UserError(f"{out}: is not empty; choose another --out")
-    absolute = Path(os.path.abspath(out))
+    absolute = Path(os.path.realpath(out))  # a link stays one
+    if holds_anything(out) or os.path.ismount(absolute):
+        raise UserError(f"{out}: is {'not empty' if holds_anything(out) else 'a mount point'}; choose another --out")
     hidden = absolute.with_name(f".{absolute.name}.export")
-    made = hidden / "new"
+    made, before = hidden / "new", hidden / "before"
     with removing_if_empty(hidden, True), owned(hidden):
         shutil.rmtree(made, ignore_errors=True)
         try:
             yield made
+            if holds_anything(out):
+                raise UserError(f"{out}: is no longer empty; choose another --out")
             with disk_errors(out):
                 if absolute.is_dir():
-                    for other in absolute.iterdir():
-                        other.rename(made / other.name)
-                    absolute.rmdir()
+                    absolute.rename(before)
                 made.rename(absolute)
+                for kept in before.iterdir() if before.is_dir() else ():
+                    kept.rename(absolute / kept.name)
         finally:
             shutil.rmtree(made, ignore_errors=True)
+            with suppress(OSError):
+                before.rename(absolute)  # fails if the new folder is there
+            with suppress(OSError):
+                before.rmdir()
 
 
 def in_use(folder: Path) -> bool:

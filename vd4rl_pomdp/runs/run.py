@@ -44,6 +44,7 @@ def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
     named = record["config"].get("exogenous")
     images = inputs.get("exogenous", named)  # a folder's content hash; generated images keep their name
     own = [] if images == named else [images]
+    own += [inputs["weights"]] if "weights" in inputs else []  # of an image model's files, which its name may not tell
     return content_hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
 
 
@@ -117,8 +118,9 @@ class RunFolder:
             )
         for name, now in self.inputs.items():
             if inputs.get(name) != now:
+                flag = "model" if name == "weights" else name
                 raise UserError(
-                    f"{self.path}: the content of --{name} {self.config.get(name)} is not what this run started with "
+                    f"{self.path}: the content of --{flag} {self.config.get(flag)} is not what this run started with "
                     f"({inputs.get(name)}, now {now}); restore that, or choose another --out"
                 )
         lost = next((name for name in self._results if self.finished and not (self.path / name).exists()), None)

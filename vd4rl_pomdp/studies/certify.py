@@ -83,7 +83,8 @@ def planned(
         for section in cell.chain[1:]:
             name = f"{_place(cell)}/{section}"
             values |= recorded(cell, section)
-            before.append(training_job(cell, section, name, out / name, data, before, values))
+            job = training_job(cell, section, name, out / name, data, before, values)
+            before.append(replace(job, content=dataset.fingerprint))  # finished runs on other data do not count
         jobs += before
     if len({job.name for job in jobs}) < len(jobs):
         raise UserError("--change lists several values of a setting: only seed may have several")

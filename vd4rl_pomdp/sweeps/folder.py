@@ -161,11 +161,11 @@ def failed(rows: list[Row]) -> bool:
 
 
 def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
-    """Names of unfinished jobs that failed or depend on one that did. `jobs` must be in dependency order."""
-    lost: set[str] = set()
-    for job in jobs:
-        if failed(rows[job.name]) or not lost.isdisjoint(job.needs):
-            lost.add(job.name)
+    """Names of unfinished jobs that failed or depend on one that did, in any order."""
+    left = list(jobs)
+    lost = {job.name for job in left if failed(rows[job.name])}
+    while more := {job.name for job in left if not lost.isdisjoint(job.needs)} - lost:
+        lost |= more
     return lost
 
 

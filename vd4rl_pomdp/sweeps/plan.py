@@ -227,7 +227,13 @@ class _Planner:
         if data.name not in self._sets:
             data.check()
             self._of_other_code.update(of_other_code(read_plan(data.folder), data.wanted))
-        data = self._sets.setdefault(data.name, data)
+        known, data = data, self._sets.setdefault(data.name, data)
+        for setting in differing(data.wanted, known.wanted)[:1]:
+            both = " and ".join(str(one.wanted.get(setting)) for one in (data, known))
+            raise UserError(
+                f"{data.folder}: the grid asks for {setting} {both} in one dataset: set {setting} in its section "
+                f"{data.section}, so that the folders' names differ"
+            )
         words = [*COMMANDS[data.section], *words_of(stage_settings(cell, data.section)), "--out", str(data.folder)]
         settings = _words_by_name(data.wanted)
         job = Job(f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=settings)
