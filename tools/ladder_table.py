@@ -189,7 +189,7 @@ def run_lines(cells: Sequence[Cell]) -> Iterator[str]:
         ]
         rows.append(row)
     head = ["set (data's return)", "policy", "best rung: return (updates)", "last rung: return (updates)"]
-    head += ["the same, evaluated clean", "critic converged at (updates)", "its final value; the data's own"]
+    head += ["the same, evaluated clean", "rungs with a converged critic", "its final value; the data's own"]
     head += ["held-out cloning loss: lowest (updates), last", "last on dataset episodes, on batches"]
     return table_lines(head, rows, (0, 1))
 
