@@ -14,9 +14,12 @@ import argparse
 import csv
 import hashlib
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported: sums depend on the number of threads
 
 from safetensors.numpy import load_file
 
