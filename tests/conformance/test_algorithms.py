@@ -82,6 +82,31 @@ class Jumping(TD3BC):
         super().move_targets()
 
 
+class Renamed(TD3BC):
+    """Has targets of other names, which never move."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.critic_target, self.policy_target = self.target_critic, self.target_policy
+        del self.target_critic, self.target_policy
+
+    def _next_value(self, batch, next_z, chosen):
+        return torch.minimum(*self.critic_target(next_z, chosen)), {}
+
+    def _next_action(self, next_z, noise):
+        return (self.policy_target.from_standardised(next_z) + noise).clamp(-1, 1)
+
+    def move_targets(self):
+        pass
+
+
+class Endless(TD3BC):
+    """Bootstraps beyond the end of the task."""
+
+    def critic_loss(self, batch, noise):
+        return super().critic_loss(batch.replace(discount=torch.ones_like(batch.discount)), noise)
+
+
 class Forgetful(TD3BC):
     """Does not restore the number of updates, which determines when the actor is updated."""
 
@@ -136,6 +161,8 @@ MUTANTS = [
     (Frozen, checks.only_the_first_loss_reaches_the_representations, "the encoder's optimiser takes no step"),
     (Twice, checks.only_the_first_loss_reaches_the_representations, "a later one has"),
     (Jumping, checks.targets_move_by_tau_and_nothing_else_moves_by_itself, "did not move by tau"),
+    (Renamed, checks.targets_move_by_tau_and_nothing_else_moves_by_itself, "critic_target, policy_target never moves"),
+    (Endless, checks.nothing_is_bootstrapped_where_the_discount_is_zero, "with other rows beyond the end"),
     (Forgetful, checks.a_resumed_algorithm_takes_the_same_steps, "update 3 logs"),
     (Drawing, checks.a_resumed_algorithm_takes_the_same_steps, "update 3 logs"),
     (Late, checks.stacks_take_the_steps_of_single_runs, "first dimension must be that of the batch"),

@@ -74,6 +74,14 @@ class Batchwise(Options):
 
 
 @dataclass(frozen=True)
+class Exposing(Options):
+    """Stretches contrast to the brightest pixel of the batch."""
+
+    def __call__(self, frames, key, number):
+        frames.copy_((frames * (255 / frames.amax())).to(torch.uint8))
+
+
+@dataclass(frozen=True)
 class Drawing(Options):
     def __call__(self, frames, key, number):
         frames[..., int(torch.randint(80, ())) :, :] = 0
@@ -126,6 +134,7 @@ MUTANTS = [
     (Nothing, checks.something_changes, "none differs"),
     (Batchwise, checks.equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
     (Batchwise, checks.the_environment_shows_what_the_data_show, "a row looks different in the environment"),
+    (Exposing, checks.equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
     (Drawing, checks.draws_depend_only_on_keys, "equal keys gave different pixels"),
     (Counting, checks.emission_never_changes_a_row, "a row looked different the second time"),
     (Counting, checks.a_view_shows_shifted_then_corrupted_stacks, "they differ under resample with a shift of 0"),

@@ -65,6 +65,13 @@ class Hidden(nn.Module):
         return x * self.weight
 
 
+class Whitened(nn.Module):
+    """Normalises by statistics of the batch, without a gradient."""
+
+    def forward(self, x):
+        return (x - x.mean().detach()) / (x.std().detach() + 1e-3)
+
+
 class Backbone(nn.Conv2d):
     """Frozen pretrained weights."""
 
@@ -80,6 +87,7 @@ MUTANTS = [
         checks.images_are_not_mixed,
         r"features of image 1 have gradients to \[True, True, True\]",
     ),
+    (Whitened, checks.images_are_not_mixed, "image 1 has other features in a batch than alone"),
     (
         Lost,
         checks.gradients_reach_all_parameters,
@@ -110,8 +118,9 @@ def test_check_frame_encoder_accepts_conforming_encoders():
         check_frame_encoder("mine", depth=3)
     with pytest.raises(UserError, match="'mixer' cuts images into patches"):
         check_frame_encoder("mixer", size=84)
-    with pytest.raises(UserError, match="unknown frame encoder 'vit'"):
-        check_frame_encoder("vit")
+    for name in ("vit", "state"):
+        with pytest.raises(UserError, match=f"unknown frame encoder '{name}'"):
+            check_frame_encoder(name)
 
 
 class Twice(nn.Module):

@@ -67,6 +67,17 @@ class Forgetful(GRU):
         return super().forward(rows, torch.zeros_like(state))
 
 
+class Ageing(GRU):
+    """Forgets its past every 64 rows of a call: windows do, streams never."""
+
+    def forward(self, rows, state):
+        parts = []
+        for part in rows.split(64, 1):
+            out, end = super().forward(part, state)
+            parts.append(out)
+        return torch.cat(parts, 1), end
+
+
 class Peeking(GRU):
     """Declares to read only the first observation, but reads all."""
 
@@ -105,6 +116,7 @@ class Hidden(GRU):
         ),
         (Short, checks.a_state_depends_only_on_its_past, "only rows 1 to 2 of window 1 may have one"),
         (Forgetful, checks.streaming_equals_batch, "they differ for"),
+        (Ageing, checks.streaming_equals_batch, "they differ over 501 rows"),
         (Peeking, checks.observations_are_read_where_it_says, "o_1 moves rows"),
         (Wide, checks.outputs_have_one_shape, r"\(3, 6, 14\)"),
         (Unused, checks.gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
@@ -117,7 +129,7 @@ def test_nonconforming_memories_are_caught(kind, check, reason):
         run_check("memory", check, "mine")
 
 
-@pytest.mark.parametrize("name", ["none", "method"])
+@pytest.mark.parametrize("name", ["none", "method", "my.memory"])
 def test_reserved_memory_names_are_rejected(name):
     with pytest.raises(UserError, match=f"memory '{name}': this name is reserved"):
         MEMORIES.register(name, MemoryPart(GRU, GRUOptions))
@@ -127,6 +139,7 @@ def test_invalid_memories_are_rejected():
     MEMORIES.register("mine", MemoryPart(lambda inputs, options: torch.nn.Identity()))
     with pytest.raises(UserError, match=r"memory .mine. builds a Identity, not a vd4rl"):
         check_memory("mine")
-    MEMORIES.register("frame", MemoryPart(GRU, GRUOptions))
-    with pytest.raises(UserError, match="memory 'frame': an encoder has an attribute of this name"):
-        check_memory("frame")
+    for name in ("frame", "memory", "encode"):
+        MEMORIES.register(name, MemoryPart(GRU, GRUOptions))
+        with pytest.raises(UserError, match=f"memory '{name}': an encoder has an attribute of this name"):
+            check_memory(name)

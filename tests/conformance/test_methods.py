@@ -4,8 +4,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
+import torch.nn.functional as F
+from torch import nn
 
 from pretrain.objectives import METHODS, Method
+from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.objective import InverseOptions, Objective, StateInverse
@@ -162,6 +165,25 @@ def test_nonconforming_methods_are_caught(kind, check, reason):
     METHODS.register("mine", Method(kind, **options))
     with pytest.raises(AssertionError, match=f"method 'mine' violates its contract(.|\n)*{reason}"):
         run_check("method", check, "mine")
+
+
+class Distant(MaskedInverse):
+    """Its future state reads the action five rows earlier: for k = 5 the one that it predicts."""
+
+    def __init__(self, encoder, target, options, seed):
+        super().__init__(encoder, target, options, seed)
+        self.back = nn.Linear(encoder.config.action_dim, encoder.config.hidden_dim, bias=False)
+
+    def representations(self, window):
+        past, future = super().representations(window)
+        earlier = F.pad(window.action, (0, 0, 5, 0))[:, : window.action.shape[1]]
+        return past, future + self.back(earlier.to(future))
+
+
+def test_leak_at_the_largest_gap_is_caught():
+    METHODS.register("mine", Method(Distant, "gru", use_actions=True, options=MaskedActionOptions))
+    with pytest.raises(AssertionError, match="the prediction of a_0 from rows 0 and 5 has gradients to"):
+        run_check("method", checks.predictions_depend_on_what_is_declared, "mine")
 
 
 def test_check_method_accepts_conforming_methods():

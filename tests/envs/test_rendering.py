@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import dm_control.mujoco
 import numpy as np
 import pytest
 
@@ -114,6 +115,18 @@ def test_frames_do_not_depend_on_the_buffer_size(task):
     with other.reset_context():
         other.set_state(start)
     np.testing.assert_array_equal(rendering.FrameCamera(other).frame(), frame)
+
+
+@pytest.mark.parametrize("size", [None, 64, 800])
+def test_other_skies_than_dm_controls_are_kept(size):
+    sky = f'<texture type="skybox" builtin="flat" rgb1="1 0 0" width="{size}" height="{size}"/>' if size else ""
+    floor = '<geom type="plane" size="1 1 1"/><camera name="c" pos="0 0 3"/>'
+    physics = dm_control.mujoco.Physics.from_xml_string(
+        f"<mujoco><asset>{sky}</asset><worldbody>{floor}</worldbody></mujoco>"
+    )
+    before = physics.model.tex_data.copy()
+    rendering.prepare(physics, "fast", 16)
+    np.testing.assert_array_equal(physics.model.tex_data, before)
 
 
 def three_frames(task, between=lambda: None):

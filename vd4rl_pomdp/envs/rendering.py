@@ -38,6 +38,8 @@ TRIED_MUJOCO = ((3, 3), (3, 18))
 _TEXTURE_AT_CORNER = (3, 12)
 _FAR = 50.0
 _FAST_SHADOW_SIZE = 512
+_SAME_SKY = 0.9
+"""Least share of equal bytes of dm_control's sky in two versions of mujoco, which differ in its stars (2%)."""
 
 
 def check_mujoco(version: str = mujoco.__version__) -> None:
@@ -61,11 +63,12 @@ def prepare(physics: Any, render: Render, size: int) -> None:
     reduced to `size` x `size`.
     """
     model, sky = physics.model, _sky()
-    number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-    start = model.tex_adr[number]
-    stored = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
-    assert stored == sky.size, "the skybox has another size than the one to restore"
-    model.tex_data[start : start + stored] = sky
+    for number in np.flatnonzero(np.asarray(model.tex_type) == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+        start = model.tex_adr[number]
+        stored = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
+        pixels = model.tex_data[start : start + stored]
+        if stored == sky.size and (pixels == sky).mean() > _SAME_SKY:  # else it is a user's own
+            pixels[:] = sky
     if _numbers(mujoco.__version__) >= _TEXTURE_AT_CORNER:
         _center_floors(model)
     model.vis.global_.offwidth = model.vis.global_.offheight = size

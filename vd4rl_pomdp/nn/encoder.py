@@ -132,7 +132,7 @@ class Encoder(nn.Module):
             self.config = config = replace(config, frame_options=config.frame_options | frame.found)
         if config.history == "none":
             return
-        if hasattr(self, config.history):
+        if config.history in {*dir(type(self)), *dir(self)}:  # not `hasattr`, which would evaluate properties
             raise UserError(f"memory {config.history!r}: an encoder has an attribute of this name: choose another")
         self.add_module(config.history, self.make_memory(self._row_width))
 

@@ -33,8 +33,8 @@ class MemoryPart:
 
 def _refuse_part(name: str, part: MemoryPart) -> None:
     """Raise UserError for a memory with a reserved name or invalid options."""
-    if name in ("none", "method"):
-        raise UserError("this name is reserved: choose another")
+    if name in ("none", "method") or "." in name:
+        raise UserError("this name is reserved, or has a dot: choose another")
     refuse_options(part.options, MemoryOptions)
 
 

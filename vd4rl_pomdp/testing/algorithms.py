@@ -169,7 +169,7 @@ def targets_move_by_tau_and_nothing_else_moves_by_itself(name: str, **options: A
     with torch.no_grad():
         for parameter in (p for module in targets.values() for p in module.parameters()):
             parameter.add_(0.5)  # targets start as copies, so their first moves would be too small to detect
-    crept = set()
+    crept, begun = set(), _networks(algorithm)
     for number in range(UPDATES):
         before = _networks(algorithm)
         steps, _ = watched(algorithm, batch(number))
@@ -182,6 +182,20 @@ def targets_move_by_tau_and_nothing_else_moves_by_itself(name: str, **options: A
             claim_close(after[key], before[key].lerp(online, tau), f"{key} did not move by tau = {tau}")
         crept |= {key.split("/")[1] for key in by_itself}
     claim(crept == targets.keys(), f"the targets are {listed(targets)}, but {listed(crept)} moved")
+    moved = {key.split("/")[1] for key in _moved(begun, _networks(algorithm))}
+    claim(not (still := {key.split("/")[1] for key in begun} - moved), f"{listed(still)} never moves")
+
+
+def nothing_is_bootstrapped_where_the_discount_is_zero(name: str, **options: Any) -> None:
+    """Losses do not depend on `next_z` and `next_action` where `discount` is 0: the task has ended there."""
+    one, other = (make(name, **options) for _ in range(2))
+    for number in range(UPDATES):
+        transitions = batch(number)
+        ended = (transitions.discount == 0)[:, None]
+        beyond = {key: transitions[key] + ended for key in ("next_z", "next_action")}
+        both = [watched(one, transitions)[0], watched(other, transitions.replace(**beyond))[0]]
+        values = [[step.loss.value.item() for step in steps] for steps in both]
+        claim(values[0] == values[1], f"with other rows beyond the end the losses are {values[1]}, not {values[0]}")
 
 
 def a_resumed_algorithm_takes_the_same_steps(name: str, **options: Any) -> None:
@@ -290,6 +304,7 @@ CHECKS: tuple[Check, ...] = (
     a_loss_moves_what_its_optimiser_steps,
     only_the_first_loss_reaches_the_representations,
     targets_move_by_tau_and_nothing_else_moves_by_itself,
+    nothing_is_bootstrapped_where_the_discount_is_zero,
     a_resumed_algorithm_takes_the_same_steps,
     stacks_take_the_steps_of_single_runs,
     actions_lie_within_their_bounds,

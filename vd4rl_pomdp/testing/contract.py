@@ -17,7 +17,7 @@ from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
 
 Check = Callable[..., None]
-"""Called with a part's name and options; the first line of its docstring is the promise printed if it fails."""
+"""Called with a part's name and options; the first paragraph of its docstring is the promise printed if it fails."""
 
 
 def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
@@ -35,7 +35,7 @@ def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
         raise
     except Exception as error:  # other people's code may raise anything
         reason = str(error) if isinstance(error, AssertionError) else f"{type(error).__name__}: {error}"
-        promise = (check.__doc__ or "").partition("\n")[0]
+        promise = " ".join((check.__doc__ or "").partition("\n\n")[0].split())
         raise AssertionError(f"{kind} {name!r} violates its contract.\nRequired: {promise}\nFound: {reason}") from error
     finally:
         np.random.set_state(drawn)  # noqa: NPY002

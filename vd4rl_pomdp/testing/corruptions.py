@@ -39,9 +39,11 @@ def check_corruption(name: str, **options: Any) -> None:
 
 
 def stacks(count: int = STACKS) -> Tensor:
-    """Random stacks (count, C, S, S) uint8 without zeros; identical at every call."""
+    """Random stacks (count, C, S, S) uint8 without zeros, each darker than the one before; identical at every call."""
     shape = (count, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE)
-    return torch.randint(1, 256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    bright = torch.randint(0, 255, shape, generator=torch.Generator().manual_seed(0))
+    darker = torch.linspace(1, 0.2, count)[:, None, None, None]  # so that statistics of a batch are not a stack's own
+    return (1 + darker * bright).to(torch.uint8)
 
 
 def _make(name: str, options: dict[str, Any]) -> Corruption:

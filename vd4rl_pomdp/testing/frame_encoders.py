@@ -11,7 +11,7 @@ from pretrain.config import PretrainConfig
 from pretrain.train import build_objective
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.frame import FrameEncoder
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoder
 from vd4rl_pomdp.testing.contract import (
     Check,
     claim,
@@ -31,6 +31,7 @@ def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> No
 
     UserError also if it cannot read images of that size or returns no maps.
     """
+    FRAME_ENCODERS.named(name)
     PretrainConfig.of("smoke", frame_encoder=name, **options)
     run_checks("frame encoder", CHECKS, name, size=size, **options)
 
@@ -71,6 +72,10 @@ def images_are_not_mixed(name: str, **options: Any) -> None:
         (gradient,) = torch.autograd.grad(weighted_sum(features[1]), obs)
         reached = gradient.flatten(1).abs().amax(1) > 0
         claim(reached.tolist() == [False, True, False], f"features of image 1 have gradients to {reached.tolist()}")
+    uneven = pictures(3, options["size"]) // torch.tensor([1, 2, 8])[:, None, None, None]
+    with torch.no_grad():  # what gradients do not show, such as detached statistics of the batch
+        frame = make(name, **options).frame.eval()
+        claim_close(frame(uneven)[1], frame(uneven[1:2])[0], "image 1 has other features in a batch than alone", 1e-5)
 
 
 def gradients_reach_all_parameters(name: str, **options: Any) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pretrain.config import PretrainConfig
 from pretrain.train import build_objective, build_target
+from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS
 from vd4rl_pomdp.core.types import Windows, previous
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.memory import Memory, make_memory, run_backward, run_memory
@@ -49,9 +50,9 @@ def encoder_of(name: str, **settings: Any) -> Encoder:
     return build_objective(config, 2, build_target(config, torch.zeros(1, 2).numpy()), None, (3, 1)).encoder.eval()
 
 
-def rows() -> Tensor:
-    """Random rows (BATCH, ROWS, INPUTS); identical at every call."""
-    return torch.randn(BATCH, ROWS, INPUTS, generator=torch.Generator().manual_seed(0))
+def rows(count: int = ROWS) -> Tensor:
+    """Random rows (BATCH, count, INPUTS); identical at every call."""
+    return torch.randn(BATCH, count, INPUTS, generator=torch.Generator().manual_seed(0))
 
 
 def windows() -> Windows:
@@ -79,11 +80,19 @@ def outputs_have_one_shape(name: str, **options: Any) -> None:
 
 
 def streaming_equals_batch(name: str, **options: Any) -> None:
-    """Encoding row by row equals encoding whole windows, with and without actions, for full and three-row histories."""
+    """Encoding row by row equals encoding whole windows, with and without actions, for full and three-row histories,
+    and over an episode's rows."""
     for method in _METHODS:
         encoder, window = encoder_of(name, **method, **options), windows()
         with torch.no_grad():
             claim_close(streamed(encoder, window), encoder.encode(window), f"they differ for {method}", 1e-5)
+    memory, long = make(name, **options).eval(), rows(EPISODE_TRANSITIONS + 1)
+    with torch.no_grad():
+        whole, state, streams = run_memory(memory, long)[0], memory.initial_state(BATCH), []
+        for row in long.split(1, 1):
+            out, state = memory(row, state)
+            streams.append(out)
+    claim_close(torch.cat(streams, 1), whole, f"they differ over {EPISODE_TRANSITIONS + 1} rows", 1e-4)
 
 
 def a_state_depends_only_on_its_past(name: str, **options: Any) -> None:

@@ -31,7 +31,7 @@ from vd4rl_pomdp.testing.contract import (
 
 ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
-_SMALLEST = {"max_k": 4, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
+_SMALLEST = {"max_k": ROWS - 1, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
 """Sizes for visibility checks, which take a backward pass per pair; with fewer units all ReLUs of the head may be
 zero."""
 _PICTURE, _GRID = (9, 84), (9, 2)
@@ -234,6 +234,8 @@ def predictions_depend_on_what_is_declared(name: str, **settings: Any) -> None:
     """The prediction for each pair depends on exactly the inputs that `visible` and `visible_frames` declare."""
     for training in (False, True):  # batch norm mixes rows only in training mode
         claim_visibility(build_inverse(name, **settings).train(training), [ROWS, ROWS, 4], ROWS)
+    if METHODS.named(name).past is not None and "m" not in settings:  # windows longer than the encoder's history
+        claim_visibility(build_inverse(name, m=2, **settings), [ROWS, ROWS, 4], ROWS)
 
 
 def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int) -> None:
