@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -97,6 +98,17 @@ def test_slurm_errors_timeouts_and_stop(fakes, tmp_path, monkeypatch, capsys):
     assert "tasks may still be running: scancel --me --name=" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("gpus", "shown"), [(0, ""), (1, "3")])
+def test_task_without_gpus_uses_none(tmp_path, monkeypatch, gpus, shown):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    seen = []
+    helper = SimpleNamespace(run=lambda: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]))
+    monkeypatch.setattr(clusters, "Driver", lambda *_, **__: helper)
+    monkeypatch.setattr(SweepFolder, "plans_to_do", lambda *_: [])
+    ClusterTask(tmp_path, "", LocalOptions(), str(tmp_path), gpus)()
+    assert seen == [shown]
+
+
 def test_slurm_options_map_to_submitit_parameters():
     asked = SlurmOptions("gpu", "lab", "high", "a100", 90, 2, 16, 62.5, 8, 50, ["--exclusive", "reservation=mine"])
     found = {name.removeprefix("slurm_"): value for name, value in parameters(asked).items()}
@@ -131,7 +143,7 @@ def test_missing_slurm_commands_are_reported(tmp_path, monkeypatch):
 class IdleCluster:
     """A cluster whose tasks end before they start a job; its second answer is an error."""
 
-    folder, tasks = Path("tasks"), 2
+    folder, tasks, gpus = Path("tasks"), 2, 0
 
     def __init__(self, stack=1):
         self.local = LocalOptions(jobs=1, stack=stack)
@@ -165,7 +177,7 @@ def test_one_task_is_requested_per_stack(fakes, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="tasks end before they start a job"):
         watch([plan], cluster, SweepFolder(tmp_path), "plan")
     assert cluster.asked == [1] * 3
-    assert fakes(stack=5).local == LocalOptions(1, 1, stack=5)
+    assert fakes(stack=5).local == LocalOptions(1, 1, threads=SlurmOptions().cpus, stack=5)
 
 
 RAY = """

@@ -50,8 +50,8 @@ def test_jobs_run_once_in_dependency_order(tmp_path, at_once):
 
 
 @pytest.mark.parametrize(("end", "cause", "attempts"), [
-    ("kill", "killed", TRIES), (TEMPORARY, "unavailable", TRIES), ("defect", "failed", 1), (1, "failed", 1),
-    (2, "failed", 1),
+    ("kill", "killed", TRIES), (143, "killed", TRIES), (TEMPORARY, "unavailable", TRIES), ("defect", "failed", 1),
+    (1, "failed", 1), (2, "failed", 1),
 ])  # fmt: skip
 def test_temporary_failures_are_retried_and_failures_reported(tmp_path, capsys, end, cause, attempts):
     bad, after, other = jobs = [
@@ -224,6 +224,8 @@ def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
     assert [place.cores for place in driver.places(LocalOptions(jobs=3))] == [(0, 1), (2, 3, 4), (5, 6, 7)]
     assert [place.cores for place in driver.places(LocalOptions(jobs=16))] == [(n // 2,) for n in range(16)]
     assert len(driver.places(LocalOptions())) == 1, "one per GPU, or one"
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "4")
+    assert [place.cores for place in driver.places(LocalOptions(jobs=2))] == [()] * 2, "Slurm binds no cores"
     monkeypatch.undo()
     monkeypatch.setattr(driver, "visible_gpus", lambda: ["2", "5"])
     assert sorted(place.gpu for place in driver.places(LocalOptions(jobs_per_gpu=3))) == ["2"] * 3 + ["5"] * 3

@@ -17,7 +17,7 @@ from vd4rl_pomdp.sweeps.stages import check_cells
 
 ROOT = Path(__file__).parents[2]
 CARD = ROOT / "tools" / "card"
-NOT_CARRIED = {"torch", "numpy", "pandas", "wandb", "huggingface-hub"}
+NOT_CARRIED = {"torch", "numpy", "wandb", "huggingface-hub"}
 """Packages that the machine provides or that trainings do not import."""
 STUB = """
 import json, os, signal, sys, time
@@ -62,6 +62,36 @@ def test_all_dependencies_are_packed_or_excluded():
     assert {canonicalize_name(r.name) for r in needed} - NOT_CARRIED <= names(carried())
     pinned = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
     assert names(carried()) <= names(pinned)
+
+
+WITHOUT = """
+import sys
+from importlib.metadata import packages_distributions, requires
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+there, new = set(), {"torch", "numpy", "scipy", *sys.argv[1].split()}
+while new:
+    there |= new
+    needed = [Requirement(r) for name in new if name in {"torch", "scipy"} | there - set(sys.argv[1].split())
+              for r in requires(name) or ()]
+    new = {canonicalize_name(r.name) for r in needed if r.marker is None or r.marker.evaluate({"extra": ""})} - there
+owners = packages_distributions()
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        of = {canonicalize_name(one) for one in owners.get(name.partition(".")[0], ())}
+        if of and not of & (there | {"vd4rl-pomdp"}):
+            raise ModuleNotFoundError(f"{name} is not carried", name=name)
+
+sys.meta_path.insert(0, Missing())
+import vd4rl_pomdp.bench.gpu, vd4rl_pomdp.cli.report, vd4rl_pomdp.cli.stages, vd4rl_pomdp.sweeps.driver
+"""
+
+
+def test_commands_import_only_what_is_there():
+    """On a machine with torch, numpy, scipy, what these require, and the carried packages."""
+    subprocess.run([sys.executable, "-c", WITHOUT, " ".join(names(carried()))], check=True)
 
 
 def test_packages_present_in_suitable_versions_are_not_packed(monkeypatch):

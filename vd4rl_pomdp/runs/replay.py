@@ -7,6 +7,7 @@ that cannot be captured, because Python branches on a value or keeps its own num
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -139,9 +140,14 @@ def _cuda_graphs(stream: torch.cuda.Stream) -> Capture:
 
     def capture(function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
         graph = torch.cuda.CUDAGraph()
-        # thread_local: ignore GPU work of other threads
-        with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
-            result = function()
+        gc.collect()
+        gc.disable()  # an old graph that is freed during a capture would break it
+        try:
+            # thread_local: ignore GPU work of other threads
+            with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
+                result = function()
+        finally:
+            gc.enable()
         return graph.replay, result
 
     return capture

@@ -39,6 +39,7 @@ class ClusterTask:
     plan: str  # name of the plan; empty: all plans in the folder
     options: LocalOptions
     cwd: str  # working directory, to which relative paths refer
+    gpus: float = 1  # GPUs of the task
 
     def __call__(self) -> None:
         """Run unclaimed jobs until none is left. SIGTERM and SIGUSR2 (Slurm's warning) end it gracefully."""
@@ -48,6 +49,8 @@ class ClusterTask:
             raise UserError(
                 f"{self.cwd}: does not exist on node {socket.gethostname()}; use a disk that all nodes share"
             ) from error
+        if not self.gpus:  # clusters may show a task the GPUs of others
+            os.environ["CUDA_VISIBLE_DEVICES"] = ""
         with interrupt.handled():
             # submitit would resubmit the task on SIGUSR2; here `watch` decides that.
             signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
@@ -62,7 +65,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
     UserError if the cluster rejects the first tasks, or tasks keep ending without progress.
     """
     jobs = jobs_of(plans)
-    task = ClusterTask(folder.out, name, cluster.local, os.getcwd())
+    task = ClusterTask(folder.out, name, cluster.local, os.getcwd(), cluster.gpus)
     said = {name: len(rows) for name, rows in folder.attempts(jobs).items()}
     vain, heard = 0, False
     try:
@@ -120,7 +123,9 @@ class SlurmCluster:
             if shutil.which(name) is None:
                 raise UserError(f"--executor slurm finds no {name} here: start the sweep where Slurm's commands are")
         self.folder, self.tasks = folder, options.tasks
-        self.local = LocalOptions(options.jobs_per_task, options.jobs_per_task, stack=options.stack)
+        at_once = options.jobs_per_task
+        self.local = LocalOptions(at_once, at_once, max(1, options.cpus // at_once), options.stack)
+        self.gpus = options.gpus
         digest = hashlib.blake2b(str(folder.resolve()).encode(), digest_size=4).hexdigest()
         self._name = f"vd4rl-pomdp-{digest}"
         self._executor = submitit.AutoExecutor(folder, cluster="slurm")
@@ -193,6 +198,7 @@ class RayCluster:
             raise UserError("--executor ray needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp") from error
         self._ray, self._options, self.folder = ray, options, folder
         self.local = LocalOptions(jobs=1, threads=max(1, int(options.cpus)), stack=options.stack)
+        self.gpus = options.gpus
         self._running: list[Any] = []
         before = signal.getsignal(signal.SIGTERM)  # ray.init replaces this handler
         try:

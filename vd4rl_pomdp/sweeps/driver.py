@@ -82,6 +82,8 @@ class Driver:
         self._not_before: dict[str, float] = {}
         """Earliest time to look at a job again that another driver runs or that just failed."""
         self._busy = time.monotonic()  # time at which something last ran
+        self._ends = False
+        """Whether it terminates its jobs."""
         self._widths: dict[str, int | None] = {}
         """Feature width by fine-tuning job, known once its encoder exists."""
 
@@ -94,6 +96,7 @@ class Driver:
                 interrupt.check("the sweep's jobs have ended")
         except BaseException:
             # Terminate all jobs at once, so that they share the grace period for their checkpoints.
+            self._ends = True
             for one in self._running:
                 one.process.terminate()
             until = time.monotonic() + PATIENCE_S
@@ -123,7 +126,8 @@ class Driver:
         for number, jobs in enumerate(processes, 1):
             # Checked only now: while we started the previous ones, another driver may have begun these.
             if self._free and (mine := [job for job in jobs if not self._is_anothers(job)]):
-                self._begin(mine, spare=len(self._free) - 1 - len(processes[number:]))
+                with interrupt.deferred():  # a process that is not listed yet would not be terminated
+                    self._begin(mine, spare=len(self._free) - 1 - len(processes[number:]))
         if self._running:
             self._busy = time.monotonic()
         idle = self._helps and time.monotonic() - self._busy > IDLE_S
@@ -194,7 +198,7 @@ class Driver:
             self._free += one.places
             code = one.process.returncode  # negative: killed by a signal
             if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
-                cause = INTERRUPTED
+                cause = INTERRUPTED if self._ends else KILLED  # by others, who may do so again at once
             else:
                 cause = KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
             line = "" if cause == DONE else _line_of_end(one.log, one.log_size)
@@ -292,10 +296,12 @@ def places(options: LocalOptions) -> list[Place]:
             "raise that, or set CUDA_VISIBLE_DEVICES to nothing to run on the CPU"
         )
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if len(cores) > int(os.environ.get("SLURM_CPUS_PER_TASK", len(cores))):
+        cores = []  # Slurm binds no cores: other tasks would get the same ones
     found = []
     for number in range(jobs):
         first, end = (place * len(cores) // jobs for place in (number, number + 1))
-        share = tuple(cores[first : max(end, first + 1)])  # at least one, if the system reports cores at all
+        share = tuple(cores[first : max(end, first + 1)])  # at least one, if any are known
         found.append(Place(share, gpus[number % len(gpus)] if gpus else None))
     return found
 
