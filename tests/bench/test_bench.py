@@ -95,4 +95,7 @@ def test_maze_training_overhead(monkeypatch):
         return [1.0, 0.1, 0.05]
 
     monkeypatch.setattr(suite, "alternating", in_turns)
-    assert suite.maze_training() == {"training_steps_per_s": 1.0, "training_overhead_share": pytest.approx(0.15)}
+    assert suite.maze_training(torch.device("cpu")) == {
+        "training_steps_per_s": 1.0,
+        "training_overhead_share": pytest.approx(0.15),
+    }

@@ -114,7 +114,7 @@ def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
         }
     results["collection"] = collection(60 if quick else 200)
     results["sharing"] = sharing(3 if quick else 10)
-    results["mazes"] = maze_pictures(60 if quick else 200) | maze_training()
+    results["mazes"] = maze_pictures(60 if quick else 200) | maze_training(place)
     return results | {"machine": machine(device), "versions": versions()}
 
 
@@ -448,12 +448,12 @@ def next_update(
     return lambda: updates(next(made))
 
 
-def maze_training() -> dict[str, float]:
+def maze_training(device: torch.device) -> dict[str, float]:
     """Steps/s of `navigation train --preset cpu`, and the fraction of a step spent on sampling and the optimiser."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         collect(MazeCollectConfig.of("smoke", maze="no_curtain", out=folder / "set", workers=1))
         config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
-        trainer, _ = make_maze_trainer(MazeData(config, folder / "cache"), config, pick_device("auto"))
+        trainer, _ = make_maze_trainer(MazeData(config, folder / "cache"), config, device)
     step, sampling, optimiser = alternating(5, trainer.update, trainer.batches.sample, trainer.optimiser.step)
     return {"training_steps_per_s": 1 / step, "training_overhead_share": (sampling + optimiser) / step}

@@ -202,7 +202,7 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
         names = ", ".join(presets)
         raise UserError(f"runs of different presets ({names}) cannot share a table; report them separately")
     for before, run in pairwise(runs):
-        if before.identity == run.identity:
+        if before.identity == run.identity and before.settings == run.settings:
             places = f"{before.result.path} and {run.result.path}"
             raise UserError(f"{places}: {run.condition.name} seed {run.seed} occurs twice; keep one")
     first: dict[Condition, NavigationRun] = {}
