@@ -97,8 +97,8 @@ INVERSE = "P(a_t | s_t, s_{t+k})"
 def facts() -> list[Row]:
     """Differences between text and enumeration: one row per world that shows one.
 
-    Every world but those of fact 3 meets the assumptions of the statement that it contradicts. Window lengths m and n are the least that
-    decode.
+    Every world but those of fact 3 meets the assumptions of the statement that it contradicts. Window lengths m and n
+    are the least that decode.
 
     Returns:
         rows of `title` (the true statement), `printed` (the paper's, and where), `world`, `quantity`, `claimed` and
