@@ -13,7 +13,6 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -192,7 +191,7 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
     """The finished runs, sorted.
 
     Raises:
-        UserError: no run is finished, one is damaged, a run occurs twice, seeds of one condition differ in steps, data
+        UserError: no run is finished, one is damaged, runs of one condition differ in steps, data
             or settings, or a value is not finite.
     """
     runs = sorted((_read_run(result) for result in results if result.finished), key=lambda run: run.identity)
@@ -201,10 +200,6 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
     if len(presets := sorted({run.preset for run in runs})) > 1:
         names = ", ".join(presets)
         raise UserError(f"runs of different presets ({names}) cannot share a table; report them separately")
-    for before, run in pairwise(runs):
-        if before.identity == run.identity and before.settings == run.settings:
-            places = f"{before.result.path} and {run.result.path}"
-            raise UserError(f"{places}: {run.condition.name} seed {run.seed} occurs twice; keep one")
     first: dict[Condition, NavigationRun] = {}
     for run in runs:
         other = first.setdefault(run.condition, run)
