@@ -5,6 +5,7 @@ With `--views 0` every batch is encoded on the fly instead.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -118,6 +119,8 @@ class FrozenEncoder:
 
 _ENCODED: WeakValueDictionary[tuple[str, str, int], Tensor] = WeakValueDictionary()
 """Features still in use by a training in this process, by everything that determines them."""
+_SAVED: dict[tuple[str, str, int], Path] = {}
+"""The last file of each."""
 
 
 def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, cached: Path, encoder: str) -> Tensor:
@@ -153,8 +156,12 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, cached
                         progress.advance(len(episodes))
         _ENCODED[key] = features
     if not cached.exists():  # also where trainings share features: each resumes by itself
-        with replacing_file(cached) as fresh, fresh.open("wb") as file:
-            np.save(file, features.cpu().numpy())
+        try:
+            os.link(_SAVED[key], cached)
+        except (KeyError, OSError):
+            with replacing_file(cached) as fresh, fresh.open("wb") as file:
+                np.save(file, features.cpu().numpy())
+    _SAVED[key] = cached
     return features
 
 

@@ -133,7 +133,8 @@ class PretrainConfig(TrainingConfig):
         method = METHODS.named(self.method)
         refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
         usual = self.defaults(self.preset)
-        for name in ("frame_encoder", "shift") if method.reads_state else ("shift",) if method.shift == "own" else ():
+        own_shift = method.shift == "own" and not getattr(self.options, "shift_shared", False)
+        for name in ("frame_encoder", "shift") if method.reads_state else ("shift",) if own_shift else ():
             if getattr(self, name) != usual[name]:
                 raise UserError(f"{flag_of(name)} is not read by the method {self.method}: leave it out")
         if method.histories and getattr(self.memory, "m", None) is not None:

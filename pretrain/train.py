@@ -232,8 +232,8 @@ def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective)
     if isinstance(frame, StateFrame):
         view: View = StateView(dataset, frame.observe, config.corruption, config.seed, STAGE)
     else:
-        pad = 0 if method.shift == "own" else config.shift
-        shared = "window" if method.shift == "own" or getattr(config.options, "shift_shared", False) else method.shift
+        shared = "window" if getattr(config.options, "shift_shared", False) else method.shift
+        pad, shared = (0, "window") if shared == "own" else (config.shift, shared)
         view = View(dataset, config.corruption, pad, config.seed, STAGE, shared=shared)
     if not method.regresses_state:
         return WindowSampler(view, config.batch_size, config.window, draws)

@@ -100,6 +100,14 @@ class Renamed(TD3BC):
         pass
 
 
+class Fixed(TD3BC):
+    """Has a network that stays as it is."""
+
+    def __init__(self, policy, *arguments):
+        super().__init__(policy, *arguments)
+        self.prior = torch.nn.Linear(2, 2).requires_grad_(False)
+
+
 class Endless(TD3BC):
     """Bootstraps beyond the end of the task."""
 
@@ -178,6 +186,11 @@ def test_nonconforming_algorithms_are_caught(kind, check, reason):
     ALGORITHMS.register("mine", kind)
     with pytest.raises(AssertionError, match=f"algorithm 'mine' violates its contract(.|\n)*{reason}"):
         run_check("algorithm", check, "mine")
+
+
+def test_fixed_networks_conform():
+    ALGORITHMS.register("mine", Fixed)
+    check_algorithm("mine")
 
 
 def test_check_algorithm_accepts_options():

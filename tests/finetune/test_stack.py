@@ -140,14 +140,15 @@ def test_stacked_runs_resume_alone_or_in_another_stack(encoder, data, tmp_path, 
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")} == before, "finished runs are not changed"
 
 
-@stacked
-def test_sigterm_saves_all_stacked_runs_after_the_step(encoder, data, tmp_path, monkeypatch):
+@pytest.mark.parametrize("together", [True, False])
+def test_sigterm_saves_all_runs_after_the_step(encoder, data, tmp_path, monkeypatch, together):
+    monkeypatch.setattr(train, "stacks_on", lambda device: together)
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(2)]
-    call = train.Updates.__call__
+    call, strikes = train.Updates.__call__, []
 
     def struck(self, done):
-        if done == 4:
-            os.kill(os.getpid(), signal.SIGTERM)
+        if done == 4 and not strikes:
+            strikes.append(os.kill(os.getpid(), signal.SIGTERM))
         return call(self, done)
 
     with monkeypatch.context() as patch:
@@ -194,8 +195,9 @@ def test_stack_with_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypa
     same_but_for_rounding(tmp_path / "1", tmp_path / "alone")
 
 
-@stacked
-def test_diverged_run_does_not_stop_its_stack(encoder, data, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("together", [True, False])
+def test_diverged_run_does_not_stop_the_others(encoder, data, tmp_path, capsys, monkeypatch, together):
+    monkeypatch.setattr(train, "stacks_on", lambda device: together)
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(3)]
     build = FinetuneTrainer.build
 

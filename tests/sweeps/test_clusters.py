@@ -101,12 +101,17 @@ def test_slurm_errors_timeouts_and_stop(fakes, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(("gpus", "shown"), [(0, ""), (1, "3")])
 def test_task_without_gpus_uses_none(tmp_path, monkeypatch, gpus, shown):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    monkeypatch.chdir(tmp_path)
     seen = []
     helper = SimpleNamespace(run=lambda: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]))
     monkeypatch.setattr(clusters, "Driver", lambda *_, **__: helper)
     monkeypatch.setattr(SweepFolder, "plans_to_do", lambda *_: [])
     ClusterTask(tmp_path, "", LocalOptions(), str(tmp_path), gpus)()
     assert seen == [shown]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    monkeypatch.setenv("SLURM_JOB_GPUS", "3")
+    ClusterTask(tmp_path, "", LocalOptions(), str(tmp_path), gpus)()
+    assert seen == [shown, "3"], "granted by --sbatch gres"
 
 
 def test_slurm_options_map_to_submitit_parameters():

@@ -225,7 +225,8 @@ def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
     assert [place.cores for place in driver.places(LocalOptions(jobs=16))] == [(n // 2,) for n in range(16)]
     assert len(driver.places(LocalOptions())) == 1, "one per GPU, or one"
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "4")
-    assert [place.cores for place in driver.places(LocalOptions(jobs=2))] == [()] * 2, "Slurm binds no cores"
+    unbound = driver.places(LocalOptions(jobs=2))
+    assert [(len(place.cores), place.pinned) for place in unbound] == [(2, False)] * 2, "of 4 unbound ones"
     monkeypatch.undo()
     monkeypatch.setattr(driver, "visible_gpus", lambda: ["2", "5"])
     assert sorted(place.gpu for place in driver.places(LocalOptions(jobs_per_gpu=3))) == ["2"] * 3 + ["5"] * 3

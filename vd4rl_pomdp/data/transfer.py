@@ -19,7 +19,7 @@ import numpy as np
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES, TASKS, DMCTask
 from vd4rl_pomdp.data.card import write_card
-from vd4rl_pomdp.data.folder import PLAN
+from vd4rl_pomdp.data.folder import PLAN, PROVENANCE
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
 from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.data.formats.base import SourceSet
@@ -90,7 +90,8 @@ def import_set(
         try:
             collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
         except UserError:
-            if episodes.called and not any(shard.path.exists() for shard in shards):
+            holds = (out / PROVENANCE).exists() or any(shard.path.exists() for shard in shards)
+            if episodes.called and not holds:
                 (out / PLAN).unlink(missing_ok=True)
             raise
     _print(episodes.notes())

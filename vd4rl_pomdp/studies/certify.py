@@ -71,12 +71,12 @@ def planned(
         f"pretrain.corruption={corruption}",
     ]
     cells = load_grid(GRID, [*about, *changes]).cells()
-    check_cells(cells, GRID)
     if not returns:
         if any(change.startswith("finetune.") for change in changes):
             raise UserError("--change finetune.* is for policies, which are trained with --returns: add it")
         without = [replace(c, sections={n: s for n, s in c.sections.items() if n != "finetune"}) for c in cells]
         cells = [cell for cell in without if cell.value("method") != STATE]
+    check_cells(cells, GRID)
     jobs: list[Job] = []
     for cell in cells:
         before, values = list[Job](), dict[str, object]()

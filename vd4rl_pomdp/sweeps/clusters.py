@@ -49,7 +49,8 @@ class ClusterTask:
             raise UserError(
                 f"{self.cwd}: does not exist on node {socket.gethostname()}; use a disk that all nodes share"
             ) from error
-        if not self.gpus:  # clusters may show a task the GPUs of others
+        granted = os.environ.get("SLURM_JOB_GPUS") or os.environ.get("SLURM_STEP_GPUS")  # e.g. by --sbatch gres
+        if not self.gpus and not granted:  # clusters may show a task the GPUs of others
             os.environ["CUDA_VISIBLE_DEVICES"] = ""
         with interrupt.handled():
             # submitit would resubmit the task on SIGUSR2; here `watch` decides that.

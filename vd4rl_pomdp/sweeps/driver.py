@@ -56,6 +56,8 @@ class Place:
 
     cores: tuple[int, ...]
     gpu: str | None  # value for CUDA_VISIBLE_DEVICES
+    pinned: bool = True
+    """Whether the job is bound to its cores; else they only count."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,7 @@ class Driver:
         """Start a process for some jobs. A stack takes one place per job, if spare, for its parallel evaluations."""
         log, gpu = self._log(jobs[0]), self._free[0].gpu
         taken = [place for place in self._free if place.gpu == gpu][: max(1, min(len(jobs), 1 + spare))]
-        place = Place(tuple(sorted({core for one in taken for core in one.cores})), gpu)
+        place = replace(taken[0], cores=tuple(sorted({core for one in taken for core in one.cores})))
         try:
             with disk_errors(log):
                 for path in map(self._log, jobs):
@@ -243,12 +245,13 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
         own["OMP_NUM_THREADS"] = str(threads or max(1, len(place.cores)))
     own |= {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
     program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: do not import from the working directory
-    mine = os.sched_getaffinity(0) if place.cores else set()
+    pinned = place.pinned and bool(place.cores)
+    mine = os.sched_getaffinity(0) if pinned else set()
     # A child inherits affinity and blocked signals. Slurm sends its time-limit warning to every process; only the task
     # itself should react, and then terminate its jobs.
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2})
     try:
-        if place.cores:
+        if pinned:
             os.sched_setaffinity(0, place.cores)
         with log.open("ab") as file:
             return subprocess.Popen(
@@ -261,7 +264,7 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
                 start_new_session=True,  # the driver handles Ctrl-C
             )
     finally:
-        if place.cores:
+        if pinned:
             os.sched_setaffinity(0, mine)
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
@@ -296,13 +299,14 @@ def places(options: LocalOptions) -> list[Place]:
             "raise that, or set CUDA_VISIBLE_DEVICES to nothing to run on the CPU"
         )
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if len(cores) > int(os.environ.get("SLURM_CPUS_PER_TASK", len(cores))):
-        cores = []  # Slurm binds no cores: other tasks would get the same ones
+    granted = int(os.environ.get("SLURM_CPUS_PER_TASK", len(cores)))
+    pinned = granted >= len(cores)  # else Slurm binds no cores, and other tasks would get the same ones
+    cores = cores[:granted]
     found = []
     for number in range(jobs):
         first, end = (place * len(cores) // jobs for place in (number, number + 1))
         share = tuple(cores[first : max(end, first + 1)])  # at least one, if any are known
-        found.append(Place(share, gpus[number % len(gpus)] if gpus else None))
+        found.append(Place(share, gpus[number % len(gpus)] if gpus else None, pinned))
     return found
 
 

@@ -28,7 +28,7 @@ class LocalOptions(Options):
     """CPU threads per job; 0: OMP_NUM_THREADS if it is set, else its share of the machine's cores."""
     stack: int = 1
     """Maximum fine-tunings trained together in one process, in the slot of one job.
-    Results match single runs up to rounding."""
+    Results match single runs (on a GPU up to rounding). On a CPU they are updated one after another."""
 
     limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64), "threads": (0, 4096), "stack": (1, 64)}
 

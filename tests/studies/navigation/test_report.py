@@ -289,6 +289,9 @@ def test_duplicate_runs_and_mixed_presets_are_rejected(tmp_path):
     write_run(tmp_path / "one", condition, 0, 9.0)
     config = write_run(tmp_path / "other", condition, 0, 9.0) / "config.json"
     assert len(loaded(tmp_path / "one", tmp_path / "other")) == 1, "one run, given twice"
+    change(config, format=2)
+    with pytest.raises(UserError, match="three_curtains/mik-K15 seed 0 occurs twice; keep one"):
+        loaded(tmp_path / "one", tmp_path / "other")
     change(config, config={"batch_size": 7})
     with pytest.raises(UserError, match=r"seeds 0 and 0 differ in their batch_size \(16, 7\)"):
         loaded(tmp_path / "one", tmp_path / "other")

@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -191,7 +192,7 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
     """The finished runs, sorted.
 
     Raises:
-        UserError: no run is finished, one is damaged, runs of one condition differ in steps, data
+        UserError: no run is finished, one is damaged or occurs twice, runs of one condition differ in steps, data
             or settings, or a value is not finite.
     """
     runs = sorted((_read_run(result) for result in results if result.finished), key=lambda run: run.identity)
@@ -210,6 +211,10 @@ def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
                     f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
                     f"({', '.join(values)}) and cannot be averaged; report them separately"
                 )
+    for before, run in pairwise(runs):
+        if before.identity == run.identity:
+            places = f"{before.result.path} and {run.result.path}"
+            raise UserError(f"{places}: {run.condition.name} seed {run.seed} occurs twice; keep one")
     return runs
 
 
