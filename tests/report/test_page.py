@@ -236,6 +236,8 @@ def test_method_names_are_escaped(tmp_path, capsys, drawn):
 def test_latex_escapes_text(tmp_path):
     texts = pd.DataFrame({"a b": ["{~^\\}", "seed_2"], "50%": ["–", "$x_1$ & #"]})
     write_latex(tmp_path / "a.tex", texts, 1, "95% of it.")
+    assert r"\caption{95\% of it.}" in (tmp_path / "a.tex").read_text()
+    write_latex(tmp_path / "a.tex", pd.concat([texts, pd.DataFrame({"a b": ["one †"], "50%": ["1"]})]), 1, "95% of it.")
     found = (tmp_path / "a.tex").read_text()
     for text in (
         r"\caption{95\% of it. \dag{}: fewer than 5 seeds.}",

@@ -85,7 +85,7 @@ def play(
     returns and a video.
 
     Args:
-        agents: Names of shipped agents, or folders from `agents export` and `hub pull`.
+        agents: One or more names of shipped agents, or folders from `agents export` and `hub pull`.
         episodes: Episodes per agent; episode i has the same initial state for all.
         film: File to write (animated WebP): each agent's first episode as it sees it.
         workers: Worker processes; 0 uses every core.

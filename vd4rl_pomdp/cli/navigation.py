@@ -50,7 +50,7 @@ def report(
     """Write the paper's navigation tables and figures for finished runs.
 
     Args:
-        runs: Run folders, results folders, or folders that contain some.
+        runs: One or more run folders, results folders, or folders that contain some.
         out: Folder of the report.
         pictures: Also draw sample observations, which needs OpenGL.
     """

@@ -42,7 +42,8 @@ def report(
     `report compare A B` compares two sets of runs.
 
     Args:
-        runs: Run folders, results folders, or folders that contain some; output of `theory --out` adds its section.
+        runs: One or more run folders, results folders, or folders that contain some; output of `theory --out` adds its
+            section.
         out: Folder of the report.
         grid: Report only the cells of this grid: a shipped one (`vd4rl-pomdp sweep list`) or a TOML or Python file.
         only: Report only grid cells with these values: method=mik+a,acro seed=0.
@@ -85,7 +86,7 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
     A run that is already there is not changed.
 
     Args:
-        runs: Run folders, results folders, or folders that contain some.
+        runs: One or more run folders, results folders, or folders that contain some.
         out: The results folder; created if missing.
     """
     print(f"{out}: {results.add_results(runs, out)}")

@@ -140,7 +140,7 @@ def evaluate(words: list[str], program: str) -> None:
 
 @command
 def list_parts() -> None:
-    """List methods, corruptions, algorithms, frame encoders, memories and tasks, one line each."""
+    """List methods, corruptions, algorithms, frame encoders, memories, tasks and formats, one line each."""
     for setting, registry in sorted(REGISTRIES.items()):
         print(f"{flag_of(setting)}   (entry point group {registry.group})")
         width = max(map(len, [*registry, *registry.broken]))

@@ -188,7 +188,7 @@ def _plots(
 def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
     """Final scores: one bar per method, one dot per run, and the data's score in the title."""
     data = {
-        (row["task"], row["quality"]): row["data_return"] / TASKS[row["task"]].score_divisor
+        tuple(row[name] for name in SETTING): row["data_return"] / TASKS[row["task"]].score_divisor
         for row in gates.to_dict("records")
         if pd.notna(row["data_return"]) and row["task"] in TASKS
     }
@@ -212,7 +212,7 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
         axes.set_ylim(max(len(rows), 4) - 0.4, -0.6)
         axes.grid(axis="y", visible=False)
         axes.set_xlabel("score")
-        if (score := data.get((row["task"], row["quality"]))) is not None:
+        if (score := data.get(tuple(row[name] for name in SETTING))) is not None:
             axes.set_title(f"{axes.get_title()} (data score {score:.1f})", fontsize=9)
         if axes.dataLim.x0 >= 0:
             axes.set_xlim(left=0)
@@ -220,7 +220,7 @@ def bar_plots(summary: pd.DataFrame, runs: pd.DataFrame, gates: pd.DataFrame, lo
     caption = (
         "Final scores under {}. Bars: mean over seeds at the last evaluation; lines: 95% t intervals over seeds and "
         "episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; missing: "
-        "seeds without a finished run."
+        "seeds without a finished run. Methods without any are not drawn."
     )
     scored = summary[summary["score"].notna()].assign(kind="mean")
     plots = _plots(scored, "scores", caption, draw, 2, height=lambda rows: 0.3 + 0.2 * max(len(rows), 4))
@@ -247,8 +247,9 @@ def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str
 
 
 def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Score over updates, one line per method; none where all were evaluated once."""
-    curves = curves[curves.groupby(list(SETTING))["step"].transform("nunique") > 1]
+    """Score over updates, one line per method; none where each was evaluated once."""
+    several = curves.groupby(list(CONDITION))["step"].transform("nunique") > 1
+    curves = curves[several.groupby([curves[name] for name in SETTING]).transform("any")]
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
         _lines(axes, rows, looks, "step", "score")

@@ -17,6 +17,7 @@ Named methods are used without variants, and only runs with equal settings are c
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import NamedTuple
@@ -137,9 +138,11 @@ def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple
     """By setting with an evaluated run, what `certificates`, by id, say about the need for memory for its datasets."""
     found = {}
     for place, mine in groups((run for run in runs if run.rows), lambda run: run.of(SETTING)).items():
-        names = dict.fromkeys(run.result.certificate for run in mine)
+        names = dict.fromkeys(run.result.certificate for run in mine)  # one per dataset
         texts = (certificate_in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
-        found[place] = "; ".join(dict.fromkeys(texts))
+        counts = Counter(texts)
+        parts = [f"{count} of {len(names)} datasets: {text}" for text, count in counts.most_common()]
+        found[place] = "; ".join(parts if len(counts) > 1 else counts)
     return found
 
 

@@ -261,7 +261,7 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     certificates = certificates_of(results, paths)
     made, judged, claimed = _tables(runs, choice, verdicts(runs, certificates))
     shown, plots, mixed = shown_tables(made), draw_plots(runs, made), unlike(runs)
-    page = _page(runs, made, shown, plots, mixed, load_section(paths))
+    page = _page(runs, made, shown, plots, mixed, load_section(paths), bool(choice.wanted))
     with owned(out):
         refuse_loss(results, out)  # again: runs may have been added meanwhile
         _write(out, made, shown, plots)
@@ -304,7 +304,9 @@ def _tables(runs: list[Run], choice: Choice, memory: dict[tuple, str]) -> tuple[
     return made, judged, claimed
 
 
-def _page(runs: list[Run], made: Tables, shown: Shown, plots: Plots, mixed: list[str], theory: str | None) -> str:
+def _page(
+    runs: list[Run], made: Tables, shown: Shown, plots: Plots, mixed: list[str], theory: str | None, wanted: bool
+) -> str:
     sets = set(made[MARK][["task", "quality"]].itertuples(index=False, name=None))
     published = pd.DataFrame([row for row in published_scores() if (row["env"], row["dataset"]) in sets])
     films, left_out = shown_films(runs)
@@ -314,6 +316,7 @@ def _page(runs: list[Run], made: Tables, shown: Shown, plots: Plots, mixed: list
         finished=sum(run.finished for run in runs),
         unfinished=[(title(run), run) for run in runs if not run.finished],
         gaps=len(made["missing"]),
+        wanted=wanted,
         rows=sum(len(run.result.rows) for run in runs),
         few=FEW_SEEDS,
         tables={name: blocks for name, (_, blocks) in shown.items()},

@@ -65,7 +65,8 @@ def write_latex(path: Path, table: pd.DataFrame, words: int, note: str = "") -> 
     wide = [max(map(len, table[name]), default=0) > SENTENCE for name in table.columns[:words]]
     form = "".join(r"p{0.3\linewidth}" if sentences else "l" for sentences in wide)
     form += "r" * (len(table.columns) - words)
-    caption = f"{note} †: fewer than {FEW_SEEDS} seeds.".strip().replace("%", r"\%")
+    marked = table.astype(str).apply(lambda column: column.str.contains("†")).to_numpy().any()
+    caption = f"{note}{f' †: fewer than {FEW_SEEDS} seeds.' if marked else ''}".strip().replace("%", r"\%")
     text = table.to_latex(index=False, escape=True, column_format=form, caption=caption, longtable=True)
     for symbol, command in SYMBOLS.items():
         text = text.replace(symbol, command)

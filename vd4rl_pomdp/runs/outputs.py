@@ -47,6 +47,7 @@ def refuse_foreign(out: Path, what: str, *marks: str) -> None:
     `marks` are files that identify what the command wrote before; `what` names it.
     """
     refuse_kept(out)
+    refuse_no_folder(out)
     if holds_anything(out) and not any((out / mark).is_file() for mark in marks):
         raise UserError(f"{out}: is not empty and holds no {what}; choose another --out")
 
