@@ -173,6 +173,8 @@ def test_negative_rows_and_counts_below_one_are_rejected(dataset):
         View(dataset).transitions(0, n_step=0)
     with pytest.raises(UserError, match="--frame-stack is 0"):
         View(dataset, frame_stack=0)
+    with pytest.raises(UserError, match="--shift is -4"):
+        View(dataset, shift=-4)
 
 
 def test_gathered_frames_are_copies(dataset):

@@ -86,6 +86,19 @@ def test_hidden_states_have_identical_observations(maze, render):
     assert len(pictures) == 1
 
 
+@pytest.mark.parametrize("state", [[0.0, 1.0], [np.nan, 1.0, 0.0, 0.0]])
+def test_invalid_states_are_rejected(state):
+    with pytest.raises(UserError, match="no_curtain: a state is 4 finite numbers"):
+        MazeEnv("no_curtain").reset(options={"state": state})
+
+
+def test_observations_are_the_callers_own():
+    env = MazeEnv("no_curtain")
+    obs, _ = env.reset(seed=0)
+    obs[:] = 0
+    assert env.render().any()
+
+
 def test_visible_states_have_distinct_observations():
     rng = np.random.default_rng(0)
     env = MazeEnv("three_curtains")

@@ -94,7 +94,10 @@ def default_cache() -> Path:
     """Folder of decoded data sets: $VD4RL_POMDP_CACHE, else the user's cache folder."""
     if chosen := os.environ.get("VD4RL_POMDP_CACHE"):
         return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vd4rl-pomdp"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vd4rl-pomdp"
+    except RuntimeError as error:
+        raise UserError("this user has no home folder: set VD4RL_POMDP_CACHE to a folder for decoded sets") from error
 
 
 def open_store(path: Path, cache: Path | None = None) -> Store:
@@ -152,7 +155,8 @@ def _decode(path: Path, folder: Path) -> dict[str, Any]:
             )
         _write_frames(stored.shards, scratch / _FRAMES, count)
         for key, value in stored.rows.items():
-            np.save(scratch / f"{key}.npy", value)
+            np.save(whole := io.BytesIO(), value)  # on a full disk numpy's own file raises without an error number
+            (scratch / f"{key}.npy").write_bytes(whole.getvalue())
         files = {p.name: {"bytes": p.stat().st_size, "blake2b": _checksum(p)} for p in sorted(scratch.iterdir())}
         names = [shard.name for shard in stored.shards]
         meta = {"rows": count, "shards": names, "attributes": stored.attributes, "files": files}

@@ -42,6 +42,7 @@ class View:
     ) -> None:
         refuse_unknown("sharing", shared, get_args(Sharing))
         refuse_number("frame_stack", frame_stack, 1)
+        refuse_number("shift", shift, 0)
         self.dataset = dataset
         self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
         self.shifts = KeyStream(stream_seed(seed, "shift", *name))

@@ -21,6 +21,7 @@ import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
 from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.envs import opengl as opengl  # before anything that loads OpenGL
 from vd4rl_pomdp.envs.mazes import MAZES
 
 Info = dict[str, Any]

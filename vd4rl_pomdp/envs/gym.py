@@ -70,7 +70,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray], gymnasium.utils.EzPickle):
 
     def render(self) -> np.ndarray:
         """The newest frame before corruption: (S, S, 3) uint8."""
-        return self._frame
+        return self._frame.copy()
 
     def close(self) -> None:
         self._env.env.close()

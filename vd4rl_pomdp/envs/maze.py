@@ -122,9 +122,12 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return observation, float(reached), False, False, info
 
     def set_state(self, state: np.ndarray) -> None:
-        """Set the simulator to a (P,) state."""
-        count = self._point.model.nq
-        self._point.set_state(np.asarray(state[:count], np.float64), np.asarray(state[count:], np.float64))
+        """Set the simulator to a (P,) state; UserError if it has another shape or is not finite."""
+        count, size = self._point.model.nq, self._point.model.nq + self._point.model.nv
+        state = np.asarray(state, np.float64)
+        if state.shape != (size,) or not np.isfinite(state).all():
+            raise UserError(f"{self.maze_spec.name}: a state is {size} finite numbers, not {state.tolist()}")
+        self._point.set_state(state[:count], state[count:])
 
     def render(self) -> np.ndarray:
         """The newest image: (100, 100, 3) uint8."""
@@ -188,7 +191,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._picture = self.draw()
         state = self.state
         info = {"state": state, "goal": self.goal.copy(), "hidden": bool(self.maze_spec.hidden(state))}
-        return self._picture, info
+        return self._picture.copy(), info
 
 
 def replay_states(maze: str, state: np.ndarray, actions: np.ndarray, action_repeat: int = ACTION_REPEAT) -> np.ndarray:

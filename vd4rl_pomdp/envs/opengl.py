@@ -18,14 +18,27 @@ from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, first_line
 
+_TOO_LATE = "MUJOCO_GL" not in os.environ and bool({"dm_control._render", "mujoco.gl_context"} & sys.modules.keys())
+"""Whether another import has already chosen how to render, by its own default."""
 os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows have only glfw
 os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales with processes, not with threads
 warnings.filterwarnings("ignore", module="glfw")  # it warns if there is no screen; rendering then raises an error
 
-with contextlib.suppress(ImportError):  # not every PyTorch build includes Triton
-    # Triton bundles its own LLVM. If PyTorch's optimisers import it after Mesa's software renderer has loaded another
-    # LLVM, the process segfaults, so import it first.
-    import triton  # noqa: F401
+
+def _mesa_came_first() -> bool:
+    """Whether the process has loaded the LLVM of Mesa's software renderer (known on Linux only)."""
+    try:
+        with open("/proc/self/maps", encoding="utf-8", errors="replace") as maps:
+            return "libLLVM" in maps.read()
+    except OSError:
+        return False
+
+
+if "triton" in sys.modules or not _mesa_came_first():
+    with contextlib.suppress(ImportError):  # not every PyTorch build includes Triton
+        # Triton bundles its own LLVM. If PyTorch's optimisers import it after Mesa's software renderer has loaded
+        # another LLVM, the process segfaults, so import it first.
+        import triton  # noqa: F401
 
 _LIBRARIES = ("OpenGL.", "glfw.", "mujoco.", "dm_control._render.", "gymnasium.envs.mujoco.mujoco_rendering.")
 """Prefixes of modules that load or use OpenGL."""
@@ -43,6 +56,13 @@ def gl_errors() -> Iterator[None]:
         if not any(f"{name}.".startswith(_LIBRARIES) for name in modules):
             raise
         _drop_half_made(error)
+        if "current on another thread" in str(error):
+            raise UserError("an environment renders only in the thread of its first frame: use it there") from error
+        if _TOO_LATE:
+            raise UserError(
+                f"dm_control or mujoco was imported before vd4rl_pomdp.envs and chose another renderer "
+                f"({first_line(error)}): import it after vd4rl_pomdp.envs, or set MUJOCO_GL before Python starts"
+            ) from error
         read = (f"{k}={shlex.quote(v)}" for k, v in sorted(os.environ.items()) if k.startswith(_VARIABLES))
         raise UserError(
             f"cannot render with {', '.join(read)} ({first_line(error)}): correct or unset the variable at fault, or "
