@@ -4,8 +4,8 @@
 
 A state and its action must identify the state k steps later among the states k steps after all other rows of the batch,
 including rows of the same window. "Global" is the encoder's output, "local" each position of its feature map. All four
-combinations are trained, each with its own projections. A score is the inner product of the projections / sqrt(64),
-softly clipped to -20..20.
+combinations are trained, each with its own projections. A score is the inner product of the projections / sqrt(64), the
+root of their dimension, softly clipped to -20..20.
 
 Authors' code: github.com/bmazoure/DRIML (within a C51 agent for Procgen).
 
@@ -15,6 +15,7 @@ Differences:
   identify the positive among negatives of other windows, and the loss would fall without any knowledge of the state.
 - k is sampled once per batch, from 1..2 by default (`--max-k`); the authors' variant with random k samples it from 1..2
   per transition. Their other variants fix k or adapt it to the game.
+- Projections are MLPs with 256 hidden units to 64 dimensions; the authors' are residual blocks to 512.
 - Actions are continuous and concatenated to psi's input; the paper embeds discrete actions.
 - Feature maps larger than 7x7 are average-pooled to 7x7 (DrQ's convolutions give 35x35).
 - A batch consists of windows of consecutive rows, so many negatives are close to the positive in time; the authors

@@ -15,6 +15,8 @@ Differences:
 - Every observation is shifted independently; the authors do not augment (`--shift 0`). A shift shared by a window would
   distinguish real transitions from imposters of other windows.
 - The authors train without the bottleneck first and then add it; here it is used from the start or not at all.
+- The bottleneck's sample is one-hot with a straight-through gradient and a learned embedding; the authors' is soft, and
+  its embedding the identity.
 - The bottleneck is optional (`--homer-codes`), since TD3+BC needs a continuous state; the saved representation is the
   one before it.
 - With `--history gru` the state at t+1 remembers row t, which makes imposters easy to spot. Interpret it accordingly.

@@ -159,6 +159,19 @@ def test_an_option_that_records_would_leave_out_is_refused(registries, kind, opt
         registries[kind].register("mine", part_with(kind, options))
 
 
+def test_options_without_a_default_or_with_wrong_limits_are_refused(registries):
+    @dataclass(frozen=True)
+    class Unset(Options):
+        depth: int
+
+    for limits, message in (({"dept": 1}, "its limits name 'dept'"), ({"depth": 5}, "--depth is 3; it must be at")):
+        options = type("Mine", (option_called("depth"),), {"limits": limits})
+        with pytest.raises(UserError, match=message):
+            registries["method"].register("mine", part_with("method", options))
+    with pytest.raises(UserError, match="its option 'depth' has no default"):
+        registries["method"].register("mine", part_with("method", Unset))
+
+
 @pytest.mark.parametrize(
     ("kind", "option", "owner"),
     [

@@ -11,7 +11,7 @@ Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py; noise: drqbc/util
 Differences:
 - Representations go straight into the policy, standardised if the encoder is frozen. The authors' actor begins with a
   trunk (Linear, LayerNorm, Tanh); here memoryless encoders end with one, frozen or not (see `end_to_end`).
-- Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
+- Initial weights are PyTorch's (theirs: orthogonal).
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from vd4rl_pomdp.nn.policy import Policy
 
 NOISE_CLIP = 0.3
 """Maximum absolute noise per action dimension."""
-NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 250_000
-"""Initial and final standard deviation of the noise, and the maximum number of updates over which it decays."""
+NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 125_000
+"""Initial and final standard deviation of the noise, and the maximum number of updates over which it decays: V-D4RL's
+250,000 steps, of which every second one is an update."""
 MARGIN = 1e-6
 """Minimum distance of a noisy action from -1 and 1."""
 
@@ -61,8 +62,8 @@ class BC(Algorithm):
 def noise_at(update: int | Tensor, planned: int) -> float | Tensor:
     """Standard deviation of the noise after some of the planned updates: decays linearly, then stays constant.
 
-    It decays over half of them if that is sooner than in V-D4RL, which trains for 550,000: noise that is still large at
-    the end of training leaves the policy's actions pushed outwards.
+    It decays over half of them if that is sooner than in V-D4RL, which trains for 550,000 updates: noise that is still
+    large at the end of training leaves the policy's actions pushed outwards.
     """
     done = share_of(update, min(NOISE_UPDATES, planned / 2))
     return NOISE_START + done * (NOISE_END - NOISE_START)

@@ -8,14 +8,15 @@ Noisy actions are clipped to [-1, 1] with a straight-through gradient.
 Authors' code: github.com/conglu1997/v-d4rl (drqbc).
 
 Differences from TD3+BC here: no target actor; an actor step with every critic step; noise that decays linearly from 1.0
-to 0.1 over 250k updates (or half of a shorter training) and is also added to the cloned action; tau 0.01.
+to 0.1 over 125k updates (or half of a shorter training) and is also added to the cloned action; tau 0.01.
 
 Differences from the authors' training loop:
 - Representations go straight into the networks, standardised if the encoder is frozen. The authors' actor and critic
   each begin with their own trunk (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's trunk
   is averaged like the rest of it. Here memoryless encoders end with such a layer, shared by all, frozen or not (see
   `end_to_end`).
-- Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
+- Initial weights are PyTorch's (theirs: orthogonal).
+- n-step returns are truncated at an episode's end; the authors drop those transitions.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ Authors' code: not published.
 
 Differences and readings:
 - Frames are encoded once and windows gathered from the features: m+1 GRU steps per row, no extra convolutions.
+- Observations are stacks: with three frames, the later window's first stack still shows the frames of the two rows
+  before it, so no frame after o_t is hidden up to k = m+3.
 - Near the start of a sampled window the past is shorter than m rows.
 - In evaluation the encoder also reads only the last m+1 rows, since it was never trained on a longer past.
 """

@@ -155,9 +155,19 @@ class Unbounded(BC):
 
 
 class Writing(BC):
+    """Changes its batch, in the second update."""
+
     def cloning_loss(self, batch, noise):
-        batch.reward.mul_(2)
+        if self.updates:
+            batch.reward.mul_(2)
         return super().cloning_loss(batch, noise)
+
+
+class Bootstrapping(TD3BC):
+    """Draws from torch's global generator."""
+
+    def next_noise(self, batch):
+        return torch.randn_like(batch.action)
 
 
 MUTANTS = [
@@ -179,6 +189,16 @@ MUTANTS = [
     (Unbounded, checks.actions_lie_within_their_bounds, "one has the size"),
     (Writing, checks.a_batch_is_left_as_it_was, "it changed: reward"),
 ]
+
+
+def test_the_first_failure_names_the_cause():
+    """Global randomness and changed batches also break later checks."""
+    ALGORITHMS.register("drawing", Bootstrapping)
+    with pytest.raises(AssertionError, match="draw from draws"):
+        check_algorithm("drawing")
+    ALGORITHMS.register("writing", Writing)
+    with pytest.raises(AssertionError, match="it changed: reward"):
+        check_algorithm("writing")
 
 
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))

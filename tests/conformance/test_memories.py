@@ -90,6 +90,11 @@ class Wide(GRU):
         return torch.cat([out, out], -1), state
 
 
+class Dropping(GRU):
+    def forward(self, rows, state):
+        return super().forward(torch.nn.functional.dropout(rows, 0.5, self.training), state)
+
+
 class Unused(GRU):
     def __init__(self, inputs, options):
         super().__init__(inputs, options)
@@ -119,6 +124,7 @@ class Hidden(GRU):
         (Ageing, checks.streaming_equals_batch, "they differ over 501 rows"),
         (Peeking, checks.observations_are_read_where_it_says, "o_1 moves rows"),
         (Wide, checks.outputs_have_one_shape, r"\(3, 6, 14\)"),
+        (Dropping, checks.equal_rows_give_equal_outputs, "they differ between calls, training True"),
         (Unused, checks.gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
         (Hidden, checks.a_folder_gives_back_the_encoder, "its states differ"),
     ],

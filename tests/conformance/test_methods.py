@@ -109,6 +109,35 @@ class Drawing(Mean):
         return loss, {"loss": loss.detach()}
 
 
+class Listed(Mean):
+    """Keeps a network in a list, where torch does not find it."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.heads = [nn.Linear(2, 2)]
+
+
+class Named(Mean):
+    def loss(self, window, progress):
+        loss, logs = super().loss(window, progress)
+        return loss, logs | {"eval/x": loss.detach()}
+
+
+class Floating(Mean):
+    def loss(self, window, progress):
+        loss, logs = super().loss(window, progress)
+        return loss, logs | {"error": loss.item()}
+
+
+class Imagined(Mean):
+    """Predicts the action of every real row; an episode's last has none."""
+
+    def loss(self, window, progress):
+        error = (self.encoder.encode(window).mean(-1) - window.action.mean(-1)).square()
+        loss = (error * window.real).sum() / window.real.sum()
+        return loss, {"loss": loss.detach()}
+
+
 class Unmasked(Mean):
     def loss(self, window, progress):
         loss = (self.encoder.encode(window).mean(-1) - 1).square().mean()
@@ -145,6 +174,9 @@ MUTANTS = [
     (Diverged, checks.a_loss_is_a_finite_scalar, "it is inf"),
     (Attached, checks.a_loss_is_a_finite_scalar, "loss is logged with its graph"),
     (Misreported, checks.a_loss_is_a_finite_scalar, "is logged, the loss is"),
+    (Floating, checks.a_loss_is_a_finite_scalar, "error is logged as float: log a detached tensor"),
+    (Listed, checks.every_network_is_registered, "those in `heads` are not: use nn.ModuleList"),
+    (Imagined, checks.padding_changes_no_loss, "actions without `has_action`"),
     (Frozen, checks.a_loss_moves_the_whole_encoder, "none reaches frame.project.0.bias"),
     (Still, checks.steps_lower_the_loss, "the mean of the first five is"),
     (Counting, checks.a_resumed_training_takes_the_same_steps, "keep what the loss reads as parameters"),
@@ -192,6 +224,9 @@ def test_check_method_accepts_conforming_methods():
     check_method("mine", feature_dim=5)
     with pytest.raises(UserError, match="--max-k is not read by the method mine"):
         check_method("mine", max_k=2)
+    METHODS.register("named", Method(Named))
+    with pytest.raises(UserError, match=r"a scalar of the loss is called 'eval/x', .*: rename it"):
+        check_method("named")
     METHODS.register("drawing", Method(DrawingInverse, options=InverseOptions))
     check_method("drawing")
     with pytest.raises(UserError, match="unknown method 'yours'"):

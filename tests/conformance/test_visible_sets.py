@@ -96,6 +96,13 @@ def test_only_fj_has_a_bounded_past_by_default():
     assert bounded == {"fj": JUMPS_PAST, "fj+a": JUMPS_PAST}
 
 
+def test_frames_after_the_predicted_action_that_fj_hides():
+    """The later window's first stack shows two more frames: with m = 8, none is hidden up to k = 11."""
+    objective, t = build_inverse("fj", m=8, max_k=15), 10
+    hidden = {k: [j for j in range(t + 1, t + k) if j not in objective.visible_frames(t, k, 32)] for k in range(1, 16)}
+    assert {k: len(frames) for k, frames in hidden.items()} == {k: max(0, k - 11) for k in range(1, 16)}
+
+
 def test_drawn_cases_cover_all_inverse_methods():
     assert {line[0] for line in LINES} == {name for name in METHODS if predicts_actions(name)}
 

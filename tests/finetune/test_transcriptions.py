@@ -19,7 +19,7 @@ from vd4rl_pomdp.core.types import Transitions
 from vd4rl_pomdp.nn.policy import Policy
 
 DIM, ACTIONS, SIZE, UPDATES, PIXELS = 3, 2, 64, 20, 12
-BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0, "rebrac": 0, "iql": 275_000, "fql": 0}
+BEGUN = {"drqv2_bc": 124_990, "bc": 124_990, "td3_bc": 0, "rebrac": 0, "iql": 275_000, "fql": 0}
 """Initial update count, so that V-D4RL's noise schedule reaches its minimum at the tenth update here, and IQL's cosine
 falls fastest."""
 
@@ -101,7 +101,7 @@ def truncated(mean: Tensor, std: float, noise: Tensor) -> Tensor:
 
 
 def scheduled(step: int) -> float:
-    mix = min(max(step / 250_000, 0.0), 1.0)
+    mix = min(max(2 * step / 250_000, 0.0), 1.0)  # an update in every second step
     return (1.0 - mix) * 1.0 + mix * 0.1
 
 

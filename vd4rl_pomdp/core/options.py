@@ -7,7 +7,7 @@ stage's config; on the command line and in records all settings form one flat li
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any, ClassVar, Self
 
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_outside, refuse_unknown
@@ -60,7 +60,7 @@ class Options:
         """Raise UserError for a number out of range, here or in nested options."""
         for kind in type(self).__mro__:
             refuse_outside(self, **vars(kind).get("limits", {}))
-        _check_options(self)
+        check_options(self)
 
 
 NO_OPTIONS = Options()
@@ -107,7 +107,7 @@ class StageConfig:
 
     def check(self) -> None:
         """Raise UserError for invalid settings, before anything is read or written."""
-        _check_options(self)
+        check_options(self)
 
     def with_known(self, **settings: Any) -> Self:
         """A copy with those of the given settings that exist here, e.g. sizes, whatever plug-ins are chosen."""
@@ -122,7 +122,8 @@ def options_in(value: Any) -> tuple[Options, ...] | None:
     return value if isinstance(value, tuple) and all(isinstance(part, Options) for part in value) else None
 
 
-def _check_options(config: Any) -> None:
+def check_options(config: Any) -> None:
+    """Raise UserError for a number out of range in the options that a config holds."""
     for field in fields(config):
         for options in options_in(getattr(config, field.name)) or ():
             options.check()
@@ -186,7 +187,14 @@ def refuse_options(kind: Any, base: type[Options] = Options) -> None:
     if not (isinstance(kind, type) and issubclass(kind, base)):
         public = base.__module__.replace("vd4rl_pomdp.core.", "vd4rl_pomdp.")
         raise UserError(f"its options are {kind!r}: name a dataclass that is derived from {public}.{base.__name__}")
-    for name, value in flat(kind.fill({})).items():
+    own = {field.name: field for field in fields(kind)}
+    if unset := [name for name, field in own.items() if field.default is field.default_factory is MISSING]:
+        raise UserError(f"its option {unset[0]!r} has no default: give it one")
+    for name in (name for one in kind.__mro__ for name in vars(one).get("limits", {}) if name not in own):
+        raise UserError(f"its limits name {name!r}, which is none of its options: correct the name")
+    usual = kind.fill({})
+    usual.check()
+    for name, value in flat(usual).items():
         # records would leave it out, so that runs or encoders with other values would count as the same
         if name in NO_SETTINGS or name in LABELS or LATER.get(name, value) != value:
             raise UserError(f"the name of its option {name!r} is taken: choose another")

@@ -62,7 +62,8 @@ def pixels_stay_pixels(name: str, **options: Any) -> None:
 def something_changes(name: str, **options: Any) -> None:
     """A corruption changes pixels; `none` changes nothing."""
     changed = not torch.equal(_make(name, options)(stacks(), torch.arange(STACKS)), stacks())
-    claim(changed == (name != "none"), f"of {STACKS} random stacks {'some differ' if changed else 'none differs'}")
+    found = "some differ" if changed else "none differs: change `frames` in place, what a stage returns is not used"
+    claim(changed == (name != "none"), f"of {STACKS} random stacks {found}")
 
 
 def equal_keys_give_equal_masks(name: str, **options: Any) -> None:

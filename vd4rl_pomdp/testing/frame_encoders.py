@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pretrain.config import PretrainConfig
 from pretrain.train import build_objective
+from vd4rl_pomdp.core.options import check_options
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoder
@@ -32,7 +33,7 @@ def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> No
     UserError also if it cannot read images of that size or returns no maps.
     """
     FRAME_ENCODERS.named(name)
-    PretrainConfig.of("smoke", frame_encoder=name, **options)
+    check_options(PretrainConfig.of("smoke", frame_encoder=name, **options))
     run_checks("frame encoder", CHECKS, name, size=size, **options)
 
 
@@ -103,9 +104,9 @@ def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
 
 
 CHECKS: tuple[Check, ...] = (
+    a_seed_decides_everything,
     features_have_one_shape,
     images_are_not_mixed,
     gradients_reach_all_parameters,
-    a_seed_decides_everything,
     a_folder_gives_back_the_encoder,
 )

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pretrain.config import PretrainConfig
 from pretrain.train import build_objective, build_target
+from vd4rl_pomdp.core.options import check_options
 from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS
 from vd4rl_pomdp.core.types import Windows, previous
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -32,7 +33,7 @@ _METHODS = ({"method": "mik+a"}, {"method": "mik"}, {"method": "mik+a", "m": 2},
 
 def check_memory(name: str, **options: Any) -> None:
     """Run all checks on a memory of `vd4rl_pomdp.nn.memory.MEMORIES`."""
-    PretrainConfig.of("smoke", history=name, **options)
+    check_options(PretrainConfig.of("smoke", history=name, **options))
     run_checks("memory", CHECKS, name, **options)
 
 
@@ -62,6 +63,15 @@ def windows() -> Windows:
     action = torch.rand(BATCH, ROWS, 2, generator=g)
     real, length = torch.ones(BATCH, ROWS, dtype=torch.bool), torch.full((BATCH,), ROWS)
     return Windows(obs, previous(action), action, real, length, torch.zeros(BATCH, ROWS, dtype=torch.int64))
+
+
+def equal_rows_give_equal_outputs(name: str, **options: Any) -> None:
+    """A memory's outputs are deterministic, in train and eval mode."""
+    memory = make(name, **options)
+    for training in (True, False):
+        with torch.no_grad():
+            first, second = (run_memory(memory.train(training), rows())[0] for _ in range(2))
+        claim(torch.equal(first, second), f"they differ between calls, training {training}")
 
 
 def outputs_have_one_shape(name: str, **options: Any) -> None:
@@ -172,6 +182,7 @@ def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
 
 
 CHECKS: tuple[Check, ...] = (
+    equal_rows_give_equal_outputs,
     outputs_have_one_shape,
     streaming_equals_batch,
     a_state_depends_only_on_its_past,

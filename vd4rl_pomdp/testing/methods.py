@@ -12,12 +12,14 @@ import torch
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from pretrain.train import build_objective, build_target
+from vd4rl_pomdp.core.options import check_options
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.types import StateWindows, Windows, previous
 from vd4rl_pomdp.corruptions import CORRUPTIONS
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS, CodeOptions, target_options
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
 from vd4rl_pomdp.nn.visibility import declared, dependence, response, wrong_pairs
+from vd4rl_pomdp.runs.metrics import Means
 from vd4rl_pomdp.testing.contract import (
     Check,
     claim,
@@ -43,7 +45,7 @@ def check_method(name: str, **settings: Any) -> None:
 
     `settings` are those of `vd4rl-pomdp pretrain`: the method's options, `history`, `frame_encoder`, ...
     """
-    PretrainConfig.of("smoke", **({"method": name, "corruption": CORRUPTIONS[-1]} | settings))
+    check_options(PretrainConfig.of("smoke", **({"method": name, "corruption": CORRUPTIONS[-1]} | settings)))
     run_checks("method", checks_of(name, **settings), name, **settings)
 
 
@@ -118,8 +120,10 @@ def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
     claim(loss.shape == (), f"its shape is {tuple(loss.shape)}")
     claim(torch.isfinite(loss), f"it is {loss.item()}")
     for key, value in logs.items():
+        claim(isinstance(value, torch.Tensor), f"{key} is logged as {type(value).__name__}: log a detached tensor")
         claim(value.numel() == 1, f"{key} is logged with shape {tuple(value.shape)}")
         claim(not value.requires_grad, f"{key} is logged with its graph: detach it")
+    Means().add(logs)
     claim("loss" in logs, f"no `loss` is logged, only {listed(logs)}")
     claim(torch.equal(logs["loss"], loss.detach()), f"{logs['loss'].item()} is logged, the loss is {loss.item()}")
 
@@ -176,15 +180,30 @@ def a_resumed_training_takes_the_same_steps(name: str, **settings: Any) -> None:
     claim_equal(here.state_dict(), there.state_dict(), "these differ at the end")
 
 
+def every_network_is_registered(name: str, **settings: Any) -> None:
+    """Every network and parameter in a list, tuple or dict of an objective is registered with torch."""
+    objective = build(name, **settings)
+    known = {id(one) for one in (*objective.modules(), *objective.parameters())}
+    for path, module in objective.named_modules():
+        for key, value in vars(module).items():
+            held = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+            loose = [one for one in held if isinstance(one, torch.nn.Module | torch.nn.Parameter)]
+            where = f"{path}.{key}".strip(".")
+            claim(known.issuperset(map(id, loose)), f"those in `{where}` are not: use nn.ModuleList, ModuleDict, ...")
+
+
 def padding_changes_no_loss(name: str, **settings: Any) -> None:
-    """Padding does not change the loss."""
+    """Rows beyond `real` do not change the loss, nor actions without `has_action`."""
     objective, window = build(name, **settings), windows(name, (4, 4, 4))
     noisy = window.replace(obs=window.obs.clone(), action=window.action.clone(), prev_action=window.prev_action.clone())
-    noisy.obs[:, 4:], noisy.action[:, 4:], noisy.prev_action[:, 5:] = 255, 7.0, 7.0
+    # row 3, the last, has no action; the future encoder of MIK+A reads its zeros
+    action = 4 if isinstance(objective, InverseObjective) else 3
+    noisy.obs[:, 4:], noisy.action[:, action:], noisy.prev_action[:, action + 1 :] = 255, 7.0, 7.0
     if isinstance(noisy, StateWindows):
         noisy = noisy.replace(state=noisy.state.index_fill(1, torch.arange(4, ROWS), 7.0))
     again = copy.deepcopy(objective)
-    claim_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0], "leave out rows beyond `real`")
+    expected, found = objective.loss(window, 0.0)[0], again.loss(noisy, 0.0)[0]
+    claim_close(found, expected, "leave out rows beyond `real` and actions without `has_action`")
 
 
 def every_action_target_is_accepted(name: str, **settings: Any) -> None:
@@ -256,6 +275,7 @@ def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int)
 
 
 TRAINED: tuple[Check, ...] = (
+    every_network_is_registered,
     a_loss_is_a_finite_scalar,
     a_loss_moves_the_whole_encoder,
     steps_lower_the_loss,
