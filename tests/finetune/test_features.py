@@ -46,7 +46,7 @@ def noise_set(folder, first_action: float = 0.0, lengths: tuple[int, ...] = LENG
     rows = fake_rows(lengths)
     rows["observation"] = np.random.default_rng(0).integers(1, 256, rows["observation"].shape, dtype=np.uint8)
     rows["action"][rows["step_type"] == 0] = first_action
-    folder.mkdir()
+    folder.mkdir(parents=True)
     write_shard(folder / "0_noise.hdf5", rows, {})
     return open_dataset(folder)
 
@@ -79,6 +79,23 @@ def test_views_differ_by_shift_and_resampled_corruption(tmp_path, corruption, mo
     assert first.shape == (len(ROWS), 8)
     for start in (0, LENGTHS[0]):
         assert torch.equal(first[start:], second[start:]) != differ
+
+
+def test_shifts_are_those_of_a_view_and_episode_or_of_a_transition(tmp_path):
+    """A memory would mistake other shifts for motion."""
+    still = noise_set(tmp_path / "set")
+    still.frames = still.frames[:1].repeat(len(ROWS), 1, 1, 1)
+    made = frozen(still, CorruptionConfig(), 4)
+    read: list[torch.Tensor] = []
+    made.encoder.frame.register_forward_pre_hook(lambda _, given: read.append(given[0]))
+    encode_views(made, Histories(still, NO_OPTIONS, N, 0), 2, tmp_path / "features.npy", "name")
+    assert [len(obs) for obs in read] == 2 * [*LENGTHS]
+    assert all((obs == obs[:1]).all() for obs in read), "one shift"
+    assert not torch.equal(read[0][0], read[2][0])
+    read.clear()
+    ExactSampler(made, NO_OPTIONS, 1, N, GAMMA, RandomStream(torch.Generator().manual_seed(3))).sample()
+    assert len(obs := torch.cat(read)) > 2
+    assert (obs == obs[:1]).all(), "one shift"
 
 
 def test_first_row_has_no_previous_action(tmp_path):

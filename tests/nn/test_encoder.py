@@ -70,6 +70,7 @@ def test_encoder_folder_round_trip(tmp_path):
     with torch.no_grad():
         torch.testing.assert_close(loaded.encode(batch), encoder.encode(batch))
     assert not any(p.requires_grad for p in loaded.parameters())
+    assert not any(part.training for part in loaded.modules())
 
 
 def test_encoder_with_unregistered_corruption_is_rejected(tmp_path):
