@@ -98,21 +98,26 @@ def test_patch_zeroes_one_square_per_frame():
     assert len(torch.unique(hidden.view(64 * 3, -1).int().argmax(1))) > 100
 
 
-def test_patch_position_is_uniform():
-    """With 5 vertical and 5 horizontal positions all 25 squares are equally likely."""
+@pytest.mark.parametrize("name", ["patch", "patch+zero_frames"])
+def test_patch_position_is_uniform(name):
+    """With 5 vertical and 5 horizontal positions all 25 squares are equally likely, whichever frames are zeroed."""
     frames = torch.full((2000, 9, 20, 20), 255, dtype=torch.uint8)
-    hidden = (make_corruption("patch")(frames, torch.arange(2000)).view(6000, 3, 20, 20) == 0).all(1)
+    hidden = (make_corruption(name)(frames, torch.arange(2000)).view(6000, 3, 20, 20) == 0).all(1)
+    hidden = hidden[~hidden.all((1, 2))]
     top, left = hidden.any(2).int().argmax(1), hidden.any(1).int().argmax(1)
     counts = (5 * top + left).bincount(minlength=25)
     assert len(counts) == 25
-    assert ((counts - 240) ** 2 / 240).sum() < 60  # chi-square, 24 degrees of freedom: 99.99% quantile is 58
+    expected = len(hidden) / 25
+    assert ((counts - expected) ** 2 / expected).sum() < 60  # chi-square, 24 degrees of freedom: 99.99% quantile is 58
 
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_patches_of_a_stack_may_share_a_position(shared):
-    out = make_corruption(CorruptionConfig.of("patch", patch_shared=shared))(stacks(), torch.arange(64))
+    config = CorruptionConfig.of("patch", patch_shared=shared, patch_count=2)
+    out = make_corruption(config)(stacks(), torch.arange(64))
     hidden = (out.view(64, 3, 3, 84, 84) == 0).all(2)
     assert torch.equal(hidden[:, 0], hidden[:, 1]) == shared
+    assert (hidden[:, 0] & hidden[:, 1]).flatten(1).any(1).all() == shared, "no patch of the next frame"
 
 
 def test_zero_frames_blanks_two_of_three_uniformly():
@@ -125,7 +130,8 @@ def test_zero_frames_blanks_two_of_three_uniformly():
 def test_resample_redraws_and_emission_does_not():
     obs, row_key = stacks(4), torch.arange(4)
     for mode, same in (("resample", False), ("emission", True)):
-        corruption = BatchCorruption(CorruptionConfig.of("patch", mode), seed=0)
+        corruption, other = (BatchCorruption(CorruptionConfig.of("patch", mode), seed) for seed in range(2))
+        assert not torch.equal(corruption(obs.clone(), row_key), other(obs.clone(), row_key))
         assert torch.equal(corruption(obs.clone(), row_key), corruption(obs.clone(), row_key)) == same
     a, b = (BatchCorruption(CorruptionConfig.of("patch"), seed=3) for _ in range(2))
     assert torch.equal(a(obs.clone(), row_key), b(obs.clone(), row_key))

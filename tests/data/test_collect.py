@@ -227,6 +227,19 @@ def test_unrendered_episodes_equal_rendered_ones(tmp_path):
     assert not (tmp_path / "set").exists()
 
 
+def test_seeds_and_episodes_have_their_own_states_actions_and_noise():
+    def played(**changes):
+        return list(module.play(config(Path(), episodes=2, **changes), LENGTH))
+
+    one, other = played(), played(seed=1)
+    for first, second in ((one[0], other[0]), (one[1], other[1]), one):
+        assert (first["physics"][0] != second["physics"][0]).any()
+        assert (first["action"][1:] != second["action"][1:]).all()
+    noise = [noisy["action"] - quiet["action"] for noisy, quiet in zip(played(action_noise=0.01), one, strict=True)]
+    whole = (np.abs(one[0]["action"]) < 0.9) & (np.abs(one[1]["action"]) < 0.9)  # not clipped
+    assert not np.isclose(noise[0][1:], noise[1][1:], atol=1e-5)[whole[1:]].any()
+
+
 def test_recorded_actor_hashes_match_shipped_actors():
     recorded = json.loads((Path(__file__).parents[2] / "results/datasets/actors.json").read_text())
     for name, hashes in recorded.items():

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.helpers_data import fake_rows, frame_identity, write_fake_set
+from tests.helpers_data import fake_rows, frame_identity, write_fake_set, write_rows
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import store as store_module
 from vd4rl_pomdp.data.format import write_shard
@@ -60,19 +60,34 @@ def test_changed_set_is_decoded_again(tmp_path, cache):
     assert before.fingerprint != after.fingerprint
 
 
+def test_rewritten_shard_of_equal_size_is_decoded_again(tmp_path, cache):
+    found = []
+    for discount in (1.0, 0.5):
+        folder = write_rows(tmp_path / "set", fake_rows((4,)) | {"discount": np.full(4, discount)})
+        os.truncate(folder / "0_fake.hdf5", 99_999)  # HDF5 ignores the zeros at its end
+        found.append(open_store(folder, cache).array("discount")[-1])
+    assert found == [1, 0.5]
+
+
 def test_fingerprint_hashes_content_and_rewards_as_float32(tmp_path, cache):
     """The last float64 bit of a reward may differ between processors."""
 
-    def fingerprint(reward):
+    def fingerprint(reward, **changes):
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
         folder.mkdir()
-        write_shard(folder / "0_fake.hdf5", rows | {"reward": reward}, {})
+        write_shard(folder / "0_fake.hdf5", rows | {"reward": reward} | changes, {})
         return open_store(folder, cache).fingerprint
 
     rows = fake_rows((5, 4))
     reward = rows["reward"] / 3
     assert fingerprint(reward) == fingerprint(np.nextafter(reward, np.inf))
     assert fingerprint(np.nextafter(reward.astype(np.float32), np.inf, dtype=np.float32)) != fingerprint(reward)
+    changed = {key: rows[key].copy() for key in ("observation", "action", "discount")}
+    for values in changed.values():
+        values[-1] = 0
+    rows["physics"] = np.zeros((9, 2))
+    changed |= {"physics": rows["physics"] + 1, "step_type": np.append(rows["step_type"][:-1], 1)}
+    assert len({fingerprint(reward), *(fingerprint(reward, **{key: changed[key]}) for key in changed)}) == 6
 
 
 def test_cache_folder_follows_environment_variables(tmp_path, monkeypatch):

@@ -61,6 +61,12 @@ def test_window_shares_one_random_shift(dataset):
     assert not torch.equal(view.observe(rows), seen)
 
 
+def test_ends_of_a_transition_are_shifted_independently(dataset):
+    dataset.frames[:] = dataset.frames[:1].clone()
+    batch = View(dataset, None, 4).transitions(range(12))
+    assert (batch.obs != batch.next_obs).flatten(1).any(1).sum() > 8
+
+
 @pytest.mark.parametrize("corruption", ["none", "zero_frames"])
 @pytest.mark.parametrize("by_lines", [True, False])
 def test_observations_can_be_shifted_independently(dataset, monkeypatch, corruption, by_lines):
