@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -134,6 +135,15 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
         write_json(out / "card.json", damaged)
         with pytest.raises(UserError, match=r"its files do not match card\.json"):
             load_agent(out)
+
+
+def test_play_prints_return_of_first_agent_less_that_of_each_other(monkeypatch, capsys):
+    cards = [{"task": "", "method": "mik+a", "seed": seed, "corruption": {"corruption": "none"}} for seed in range(2)]
+    played = [[SimpleNamespace(total=total) for total in totals] for totals in ((30.0, 40.0), (10.0, 24.0))]
+    monkeypatch.setattr("finetune.export.play_agents", lambda *_: (cards, played))
+    main(["agents", "play", "one", "other"])
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if " less " in line)
+    assert line.split("[")[0].split() == ["mik+a,", "seed", "0", "less", "mik+a,", "seed", "1", "18"]
 
 
 def test_film_of_agents_with_different_frame_sizes():

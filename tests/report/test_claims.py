@@ -123,6 +123,8 @@ def test_holm_correction_applies_within_claim_families(tmp_path):
     assert seen["p"] == pytest.approx(p("acro", "acro", "none"))
     assert (rows[MEMORY]["verdict"], seen["verdict"]) == ("undecided", "holds")
     assert rows[MEMORY]["p"] < 0.05 < rows[MEMORY]["adjusted_p"], "it would hold without adjustment"
+    with_another = judge_claims(load_runs([write(tmp_path, scores, algorithm="iql")]))
+    assert [row for row in with_another if row["algorithm"] == "td3_bc"] == [*rows.values()], "each setting by itself"
 
 
 def test_seeds_with_individual_sets_are_compared(tmp_path):

@@ -83,6 +83,8 @@ def test_improvement_is_averaged_over_tasks():
     assert row["tasks"] == 2
     (other,) = of(tables.improvement(rows()), method="mik", other="acro")
     assert row["probability"] + other["probability"] == pytest.approx(1.0)
+    assert row["low"] < row["high"]
+    assert (other["low"], other["high"]) == pytest.approx((1 - row["high"], 1 - row["low"]))
 
 
 def evaluated_clean(run, returns, errors):

@@ -127,6 +127,14 @@ def test_run_killed_at_any_system_call_resumes(tmp_path, monkeypatch):
     assert 10 < number < 199
 
 
+def test_resuming_removes_the_mark_of_divergence(tmp_path):
+    with begin(tmp_path) as run:
+        run.mark_diverged(1, "loss is nan")
+    assert (tmp_path / "diverged.json").exists()
+    with begin(tmp_path):
+        assert not (tmp_path / "diverged.json").exists()
+
+
 def test_timing_adds_up_over_resumptions(tmp_path):
     with begin(tmp_path) as run:
         run._started -= 100.0
@@ -179,6 +187,7 @@ def _changed(value, place, new):
     [
         *(("config.out", "b", NEITHER), ("config.device", "cuda", NEITHER), ("config.log_every", 9, NEITHER)),
         *(("inputs.encoder", "x", NEITHER), ("inputs.data", "0ff", IDENTITY), ("card.data", "0ff", IDENTITY)),
+        ("inputs.weights", "x", IDENTITY),
         *(("config.seed", 1, BOTH), ("config.updates", 41, BOTH), ("format", 4, BOTH), ("stage", "pretrain", BOTH)),
         *(("card.seed", 1, BOTH), ("card.settings.steps", 21, BOTH), ("card.settings.future_frames", "newest", BOTH)),
         # settings of later versions count only where they differ from the earlier behaviour
