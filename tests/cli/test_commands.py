@@ -12,6 +12,7 @@ from finetune.algorithms import ALGORITHMS
 from finetune.algorithms.bc import BC
 from vd4rl_pomdp.cli import COMMANDS, main, run_to_end, stages
 from vd4rl_pomdp.cli.parsing import show
+from vd4rl_pomdp.core.errors import TEMPORARY
 from vd4rl_pomdp.core.registry import REGISTRIES
 
 SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
@@ -141,6 +142,15 @@ def test_help_imports_no_torch_and_survives_a_closed_pipe():
     assert process.stdout is not None
     process.stdout.close()
     assert (process.communicate()[1], process.returncode) == (b"", 141)
+
+
+@pytest.mark.parametrize(("words", "to", "code"), [
+    ("data check nowhere", "2>/dev/full", 2), ("data check nowhere", ">/dev/full 2>&1", 2),
+    ("sweep list", ">/dev/full 2>&1", TEMPORARY),
+])  # fmt: skip
+def test_full_disk_under_the_log_keeps_the_exit_code(words, to, code):
+    command = f"{sys.executable} -m vd4rl_pomdp {words} {to}"
+    assert subprocess.run(command, shell=True, check=False).returncode == code
 
 
 CONFIGURED = {"list", "data collect", "data view", "pretrain", "finetune", "evaluate", "navigation collect"}

@@ -10,7 +10,7 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, disk_error, in_one_line
@@ -80,8 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # e.g. \u2028, which a terminal may not show
     end = run_to_end(sys.argv[1:] if arguments is None else arguments)
-    if end.line:
-        print(end.line, file=sys.stderr)
+    try:
+        print(end.line, end="\n" * bool(end.line), file=sys.stderr, flush=True)
+    except OSError:  # e.g. a job's log on a full disk; only the exit code reaches the sweep
+        _discard(sys.stderr)
     if end.code:
         sys.exit(end.code)
 
@@ -96,7 +98,13 @@ def run_to_end(words: Sequence[str]) -> End:
             try:
                 _run(list(words))
             finally:
-                sys.stdout.flush()  # here, where a closed pipe is handled; --help ends in SystemExit
+                failure = sys.exception()
+                try:
+                    sys.stdout.flush()  # here, where a closed pipe is handled; --help ends in SystemExit
+                except OSError as error:
+                    _discard(sys.stdout)
+                    if failure is None or isinstance(error, BrokenPipeError):  # else a full disk is no news
+                        raise
     except UserError as error:
         return End(error.code, f"error: {in_one_line(error)}")
     except UnicodeEncodeError as error:
@@ -108,7 +116,6 @@ def run_to_end(words: Sequence[str]) -> End:
         where = getattr(error, "reason", str(error))
         return End(code, f"{how}: {where}{'; ' if where else ''}re-run the same command to resume")
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
         return End(141)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
@@ -119,6 +126,11 @@ def run_to_end(words: Sequence[str]) -> End:
         named = disk_error(error.filename, error)
         return End(named.code, f"error: {named}")
     return End()
+
+
+def _discard(stream: TextIO) -> None:
+    """Discard what a stream could not write. Python flushes it once more at its end, and would change the exit code."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _run(words: list[str]) -> None:
