@@ -3,6 +3,7 @@
 import errno
 import multiprocessing
 import os
+import resource
 import shutil
 import signal
 from collections.abc import Callable
@@ -27,7 +28,7 @@ from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
@@ -332,6 +333,19 @@ def test_features_are_encoded_once_over_resumptions(encoder, finetuned, data, tm
     assert len(encoded) == 3, "one call per episode"
     assert not (config.out / "features.npy").exists()
     assert contents(config.out) == contents(finetuned)
+
+
+def test_failed_append_leaves_a_run_unchanged(finetuned, tmp_path):
+    path = shutil.copy(finetuned / "episodes.csv", tmp_path / "episodes.csv")
+    before, rows = path.read_bytes(), read_episodes(path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 100, limits[1]))  # in the second row
+    try:
+        with pytest.raises(UserError, match="file too large"):
+            append_episodes(path, rows)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])

@@ -87,7 +87,7 @@ def test_truncated_last_row_is_rejected_until_dropped(tmp_path):
     row = read_episodes(path)[0]
     path.write_text(ROWS[:-2])
     for use in (read_episodes, lambda path: append_episodes(path, [row])):
-        with pytest.raises(UserError, match=r"a row is not whole \(the last line has no end\); remove it"):
+        with pytest.raises(UserError, match=r"a row is not whole \(the last line has no end\); remove that row"):
             use(path)
     assert path.read_text() == ROWS[:-2]
     drop_episodes_after(path, 2)

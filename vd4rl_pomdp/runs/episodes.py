@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 from pathlib import Path
 
 from vd4rl_pomdp.core.errors import UserError
@@ -30,7 +29,7 @@ def append_episodes(path: Path, rows: list[Row]) -> None:
     there = read_episodes(path)
     with appending(path) as file:
         writer = csv.DictWriter(file, list(there[0]) if there else COLUMNS, lineterminator="\n")
-        if not os.fstat(file.fileno()).st_size:  # checked under the file lock
+        if not path.stat().st_size:  # checked under the file lock
             writer.writeheader()
         writer.writerows(rows)
 
@@ -62,7 +61,7 @@ def drop_episodes_after(path: Path, step: int) -> None:
 def _parse(path: Path, content: bytes) -> list[Row]:
     if not content:
         return []
-    with damaged(path, "a row is not whole", "remove it"):
+    with damaged(path, "a row is not whole", "remove that row"):
         if not content.endswith(b"\n"):
             raise ValueError("the last line has no end")
         reader = csv.DictReader(io.StringIO(content.decode(), newline=""))

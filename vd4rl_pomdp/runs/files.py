@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import fcntl
 import hashlib
+import io
 import json
 import os
 import secrets
@@ -93,16 +94,24 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[IO[str]]:
-    """Append to a text file, flushed to disk when the block ends since checkpoints rely on it.
+    """Append the text written within the block to a file, and flush it to disk since checkpoints rely on it.
 
-    Concurrent writers wait for each other where the file system supports locks. UserError if the system refuses.
+    Concurrent writers wait for each other where the file system supports locks. UserError if the system refuses; the
+    file is then as before.
     """
-    with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
+    with disk_errors(path), path.open("ab", buffering=0) as file:
         with suppress(OSError):  # some file systems have no locks
             fcntl.flock(file.fileno(), fcntl.LOCK_EX)
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
+        text = io.StringIO(newline="")
+        yield text
+        content, size = text.getvalue().encode(), os.fstat(file.fileno()).st_size
+        try:
+            while content:  # a full disk takes a part, and refuses the next one
+                content = content[file.write(content) :]
+            os.fsync(file.fileno())
+        except BaseException:
+            file.truncate(size)
+            raise
 
 
 def synchronise(path: Path) -> None:
