@@ -151,6 +151,14 @@ def test_folder_in_use_names_its_process_until_it_dies(tmp_path):
     assert not list((tmp_path / "run").iterdir())
 
 
+def test_folder_on_a_read_only_disk_counts_as_in_use(tmp_path, monkeypatch):
+    def acquire(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", acquire)
+    assert in_use(fill(tmp_path / "run", __lock=""))
+
+
 def test_built_folder_appears_complete_and_keeps_hidden_files(tmp_path):
     out = fill(tmp_path / "out", __DS_Store="of a file manager")
     with built(out) as made:

@@ -6,6 +6,7 @@ process writes, it holds a file lock, which the system releases when the process
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import socket
@@ -160,11 +161,13 @@ def built(out: Path) -> Iterator[Path]:
 
 
 def in_use(folder: Path) -> bool:
-    """Whether another process owns a folder. True if permissions keep us from checking."""
+    """Whether another process owns a folder. True if permissions or a read-only disk keep us from checking."""
     if not (folder / LOCK).exists():
         return False
     try:
         with FileLock(folder / LOCK).acquire(timeout=0):
             return False
-    except (Timeout, PermissionError):
-        return True
+    except OSError as error:
+        if isinstance(error, Timeout | PermissionError) or error.errno == errno.EROFS:
+            return True
+        raise
