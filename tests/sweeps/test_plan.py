@@ -217,6 +217,19 @@ def test_policies_on_a_replaced_encoder_are_reported(copy):
     assert planned(copy)[1] == []
 
 
+def test_missing_dataset_of_finished_runs_is_reported(copy):
+    record_collection(copy)
+    (copy / "data" / "walker_walk" / "expert").rename(copy / "away")
+    assert planned(copy)[1] == [], "nothing needs it"
+    _, (warning,) = planned(copy, ["finetune.updates=7"])
+    assert warning == (
+        f"{copy}/data/walker_walk/expert: is missing and will be collected again, though 3 runs here were trained on "
+        "it: put it back; if the content differs they do not count"
+    )
+    (copy / "away").rename(copy / "data" / "walker_walk" / "expert")
+    assert planned(copy, ["finetune.updates=7"])[1] == []
+
+
 def test_requested_or_needed_encoders_are_trained(copy, tmp_path):
     blocks = ["[[block]]\n", "[[block]]\nfinetune = { updates = 7 }\n"]
     head = GRID.partition("[finetune]")[0] + 'method = "acro"\n'

@@ -203,7 +203,8 @@ def plan_jobs(
     planner = _Planner(out, data, kept, others)
     for cell in cells:
         planner.add(cell)
-    return planner.needed(), list(planner.warnings())
+    jobs = planner.needed()
+    return jobs, list(planner.warnings(jobs))
 
 
 class _Planner:
@@ -221,6 +222,7 @@ class _Planner:
         self._of_other_code: Counter[str] = Counter()
         self._of_other_content: Counter[str] = Counter()
         self._on_other_encoders = 0
+        self._on_missing: Counter[str] = Counter()  # runs here by dataset job that is not there
 
     def add(self, cell: GridCell) -> None:
         data = set_of(cell, self._data)
@@ -253,6 +255,8 @@ class _Planner:
         run = _found(self._here, own, data)
         if run is not None:
             self._of_other_code.update(of_other_code(run.record, values))
+            if not data.there:
+                self._on_missing[before[0].name] += 1
             encoder = before[-1].folder / "encoder"
             if section == "finetune" and (encoder / CONFIG).is_file():
                 self._on_other_encoders += run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
@@ -298,8 +302,14 @@ class _Planner:
             found.append(job)
         return found[::-1]
 
-    def warnings(self) -> Iterator[str]:
-        """Reasons why runs do or do not count that a user may not expect."""
+    def warnings(self, jobs: list[Job]) -> Iterator[str]:
+        """Reasons why runs do or do not count that a user may not expect, given the needed jobs."""
+        for job in jobs:
+            if number := self._on_missing[job.name]:
+                yield (
+                    f"{job.folder}: is missing and will be collected again, though {number} runs here were trained on "
+                    "it: put it back; if the content differs they do not count"
+                )
         for name, number in self._of_other_content.items():
             line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
             yield f"{name}: {line}: they do not count"
