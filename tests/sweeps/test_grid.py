@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers_bad_input import rejection
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.studies.navigation.runs import condition_of, paper_rows
@@ -72,6 +73,25 @@ def test_testing_section_and_changes_override_settings(file):
     }
     with pytest.raises(UserError, match="seed is changed twice; for several values write them as in seed=0,1"):
         load_grid(path, ["seed=3", "pretrain.steps=10", "seed = 4"])
+
+
+@pytest.mark.parametrize("testing", [False, True])
+def test_overrides_apply_only_to_blocks_with_their_section(file, testing):
+    encoders = TOML.partition("[finetune]")[0]
+    blocks = '[[block]]\n[[block]]\npretrain = { history = "gru" }\nfinetune = { updates = 40 }\n'
+    own, changes = ("[testing]\nfinetune = { updates = 7 }\n", []) if testing else ("", ["finetune.updates=7"])
+    cells = load_grid(file(encoders + blocks + own), changes, testing).cells()
+    assert {(cell.value("history"), cell.chain[1:], cell.value("updates")) for cell in cells} == {
+        (None, ("pretrain",), None), ("gru", ("pretrain", "finetune"), 7),
+    }  # fmt: skip
+    with pytest.raises(UserError, match="no block has a section finetune"):
+        load_grid(file(encoders + own), changes, testing)
+
+
+def test_testing_needs_a_testing_section(file):
+    assert rejection(["sweep", "run", path := file(TOML), "--testing", "--out", "out", "--dry-run"]) == (
+        f"error: {path}: has no [testing] section: add one, or leave out --testing"
+    )
 
 
 def test_python_grid_file(file):

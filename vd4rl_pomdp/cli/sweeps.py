@@ -75,7 +75,7 @@ class RunCommand(_ExecutorConfig):
     only: list[str] = field(default_factory=list)
     """Run only cells with these values: method=mik+a,acro seed=0."""
     change: list[str] = field(default_factory=list)
-    """Overrides for every block: preset=cpu finetune.updates=20000."""
+    """Overrides for the blocks with that section: preset=cpu finetune.updates=20000."""
     testing: bool = False
     """Run the grid's testing subset: minutes, to check that everything works."""
     done: list[Path] = field(default_factory=list)

@@ -21,7 +21,7 @@
     only = ["task=cheetah_run"]
     finetune = { updates = 60000 }
 
-    [testing]                             # overrides for all blocks under `--testing`
+    [testing]                             # overrides under `--testing`, for the blocks that have the section
     preset = "smoke"
 
 A grid without [[block]] is a single block. A Python file defines the same as a dict called GRID.
@@ -116,7 +116,8 @@ class Grid:
         """All cells without duplicates, ordered by seed: every condition runs its first seed before any second one."""
         cells: dict[str, GridCell] = {}
         for block in self.blocks:
-            for cell in _product(_merge(self.common, block, self.last), block):
+            whole = _merge(self.common, block)
+            for cell in _product(_merge(whole, _within(whole, self.last)), block):
                 for where in self.wheres:
                     cell = where.applied(cell, self.last)
                 cells.setdefault(repr(cell.sections), cell)
@@ -131,13 +132,15 @@ def names() -> list[str]:
 def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> Grid:
     """Read a shipped grid, or a TOML or Python file; UserError if it does not exist or is invalid.
 
-    `changes` are overrides for all blocks, e.g. "pretrain.steps=100" or "seed=0,1"; `testing` applies those of
-    [testing].
+    `changes` are overrides for all blocks that have the section, e.g. "pretrain.steps=100" or "seed=0,1"; `testing`
+    applies those of [testing].
     """
     path = GRIDS / f"{name}.toml" if name in names() else Path(name)
     content = _read(path, name)
     try:
-        title, tests = content.pop("title", path.stem), content.pop("testing", {})
+        title, tests = content.pop("title", path.stem), content.pop("testing", None)
+        if testing and tests is None:
+            raise UserError("has no [testing] section: add one, or leave out --testing")
         tables = {name: content.pop(name, []) for name in ("block", "where")}
         for kind, found in tables.items():
             if not isinstance(found, list):
@@ -148,8 +151,12 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
             raise UserError(f"{twice[0]} is changed twice; for several values write them as in seed=0,1")
         last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
         whole = [_merge(common, block) for block in blocks]
+        if foreign := [name for name in last if not any(name in block for block in whole)]:
+            raise UserError(
+                f"no block has a section {foreign[0]}, which --change or [testing] sets: add or leave it out"
+            )
         for block in whole:
-            _check_block(_merge(block, last))
+            _check_block(_merge(block, _within(block, last)))
         wheres = [_where(table, whole) for table in tables["where"]]
         return Grid(path.stem, str(title), common, blocks, wheres, last)
     except UserError as error:
@@ -283,6 +290,11 @@ def _merge(*parts: Sections) -> Sections:
         for section, settings in part.items():
             merged[section] = merged.get(section, {}) | settings
     return merged
+
+
+def _within(block: Sections, last: Sections) -> Sections:
+    """The overrides of sections that a block has: others would add a stage to it."""
+    return {section: settings for section, settings in last.items() if section in block}
 
 
 def _value_of(sections: Sections, name: str) -> Any:
