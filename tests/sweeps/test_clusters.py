@@ -13,10 +13,11 @@ from types import SimpleNamespace
 import pytest
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_sweeps import begun, job, keep_plan, policy, until
+from tests.helpers_sweeps import RECORD, begun, job, keep_plan, policy, until
 from tests.sweeps.slurm_cluster import slurm, why_not
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
+from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.sweeps import clusters
 from vd4rl_pomdp.sweeps.clusters import ClusterTask, RayCluster, SlurmCluster, parameters, watch
 from vd4rl_pomdp.sweeps.folder import SweepFolder, is_finished
@@ -145,6 +146,39 @@ def test_missing_slurm_commands_are_reported(tmp_path, monkeypatch):
         SlurmCluster(SlurmOptions(), tmp_path)
 
 
+REJECTING = """n=$(grep -c ^sbatch {called}); [ $n = 1 ] && echo Submitted batch job 7 && exit
+[ $n = 3 ] && for job in {out}/?; do echo '{{}}' > $job/timing.json; done
+echo Unable to contact slurm controller >&2; exit 1"""
+
+
+def test_rejected_resubmission_is_retried_and_running_tasks_continue(fakes, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(clusters, "LOOK_S", 0.0)
+    jobs = [job(tmp_path / "out", name) for name in "ab"]
+    plan = keep_plan(tmp_path / "out", *jobs)
+    for one in jobs:
+        write_json(one.folder / "config.json", RECORD)
+    called = tmp_path / "called"
+    cluster = fakes(sbatch=REJECTING.format(called=called, out=tmp_path / "out"), squeue="echo RUNNING")
+    assert watch([plan], cluster, SweepFolder(tmp_path / "out"), "plan")
+    assert capsys.readouterr().err.count("Unable to contact slurm controller); trying again") == 2
+    assert "scancel" not in called.read_text()
+    cluster = fakes(
+        sbatch="[ -e {0} ] && exit 1; echo > {0}; echo Submitted batch job 7".format(tmp_path / "once"), squeue=":"
+    )
+    (jobs[0].folder / "timing.json").unlink()
+    with pytest.raises(UserError, match="Slurm rejected the job array"):
+        watch([plan], cluster, SweepFolder(tmp_path / "out"), "plan")
+
+
+def test_slurm_sweeps_of_different_plans_have_different_tasks(fakes, tmp_path):
+    fakes()
+    names = set()
+    for plan in ("grid", "grid", "other"):
+        SlurmCluster(SlurmOptions(), tmp_path / "slurm", plan).live()
+        names.add((tmp_path / "called").read_text().splitlines()[-1])
+    assert len(names) == 2
+
+
 class IdleCluster:
     """A cluster whose tasks end before they start a job; its second answer is an error."""
 
@@ -248,5 +282,12 @@ def test_unreachable_ray_cluster_is_reported(tmp_path):
         UserError, match=f"no Ray cluster at --address 127.0.0.1:{port} .*Connection refused.*ray start"
     ):
         RayCluster(RayOptions(address=f"127.0.0.1:{port}"), tmp_path)
-    with pytest.raises(UserError, match="whole number"):
-        RayOptions(gpus=1.5).check()
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (SlurmOptions(gpus=4), "--gpus 4 is more than --jobs-per-task 1, and a job uses one GPU"),
+    (RayOptions(gpus=2), "--gpus is 2; it must be at least 0 and at most 1"),
+])  # fmt: skip
+def test_gpus_that_no_job_uses_are_rejected(options, message):
+    with pytest.raises(UserError, match=message):
+        options.check()

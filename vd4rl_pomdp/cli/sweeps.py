@@ -139,7 +139,10 @@ def carry_out(plans: list[folders.Plan], folder: folders.SweepFolder, kind: str,
     if kind == "local":
         finished = driver.Driver(plans, options, folder).run()
     else:
-        cluster = {"slurm": clusters.SlurmCluster, "ray": clusters.RayCluster}[kind](options, folder.path / kind)
+        place = folder.path / kind
+        cluster = (
+            clusters.SlurmCluster(options, place, name) if kind == "slurm" else clusters.RayCluster(options, place)
+        )
         finished = clusters.watch(plans, cluster, folder, name)
     jobs = folders.jobs_of(plans)
     if not finished:

@@ -31,6 +31,10 @@ ANSWER_S = 30.0  # timeout of a command to the cluster, seconds
 VAIN = 3  # resubmissions without any progress before the sweep gives up
 
 
+class RejectedError(UserError):
+    """The cluster rejected a submission."""
+
+
 @dataclass(frozen=True)
 class ClusterTask:
     """What runs on a node: a driver that helps with a sweep."""
@@ -63,7 +67,8 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
     """Keep a sweep's tasks on the cluster until no job can run any more. Return whether all jobs are finished.
 
     The cluster's nodes see all folders at the same paths. `name` is that of the plan; empty: all plans in the folder.
-    UserError if the cluster rejects the first tasks, or tasks keep ending without progress.
+    UserError if the cluster rejects the first tasks, or later ones again and again while none is left, or tasks keep
+    ending without progress.
     """
     jobs = jobs_of(plans)
     task = ClusterTask(folder.out, name, cluster.local, os.getcwd(), cluster.gpus)
@@ -85,6 +90,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                 vain = 0
             try:
                 live = cluster.live()
+                heard |= live > 0
                 processes = len(in_stacks(could, cluster.local.stack, attempts))
                 wanted = min(cluster.tasks, -(-processes // cluster.local.jobs)) - live
                 if wanted > 0:
@@ -94,8 +100,9 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                     with interrupt.deferred():  # an interrupted submission could not be cancelled
                         cluster.submit(task, wanted)
                 heard = True
-            except UnavailableError as error:
-                if not heard:  # fail on the first contact; later, keep trying
+            except (UnavailableError, RejectedError) as error:
+                # Fail on the first contact. Later, keep trying: a rejection may pass, and must not end running tasks.
+                if not heard or (isinstance(error, RejectedError) and not live and vain == VAIN):
                     raise
                 print(f"warning: {error}; trying again", file=sys.stderr, flush=True)
             until = time.monotonic() + LOOK_S
@@ -108,9 +115,9 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
 
 
 class SlurmCluster:
-    """A sweep's tasks as Slurm job arrays, submitted by submitit under a job name hashed from the folder."""
+    """A sweep's tasks as Slurm job arrays, submitted by submitit under a job name hashed from folder and plan."""
 
-    def __init__(self, options: SlurmOptions, folder: Path) -> None:
+    def __init__(self, options: SlurmOptions, folder: Path, plan: str = "") -> None:
         """Check that submitit and Slurm's commands are installed, or raise UserError. Slurm is not contacted yet.
 
         Submitit and the tasks write into `folder`, on a disk shared by all nodes.
@@ -127,7 +134,8 @@ class SlurmCluster:
         at_once = options.jobs_per_task
         self.local = LocalOptions(at_once, at_once, max(1, options.cpus // at_once), options.stack)
         self.gpus = options.gpus
-        digest = hashlib.blake2b(str(folder.resolve()).encode(), digest_size=4).hexdigest()
+        # Sweeps of other plans in the folder have other names: each counts and cancels only its own tasks.
+        digest = hashlib.blake2b(f"{folder.resolve()}\n{plan}".encode(), digest_size=4).hexdigest()
         self._name = f"vd4rl-pomdp-{digest}"
         self._executor = submitit.AutoExecutor(folder, cluster="slurm")
         self._executor.update_parameters(name=self._name, stderr_to_stdout=True, **parameters(options))
@@ -142,7 +150,7 @@ class SlurmCluster:
                 self._executor.submit_array([task] * number)
         except RuntimeError as error:  # how submitit reports a failed command
             reason = (str(error).strip() or "it does not say why").splitlines()[-1]
-            raise UserError(f"Slurm rejected the job array ({reason})") from error
+            raise RejectedError(f"Slurm rejected the job array ({reason})") from error
 
     def stop(self) -> None:
         """Cancel pending tasks, signal the running ones to checkpoint and exit, and wait for them."""

@@ -67,6 +67,15 @@ class SlurmOptions(Options):
         **{"jobs_per_task": (1, 1024), "tasks": (1, 1000), "stack": (1, 64)},
     }
 
+    def check(self) -> None:
+        """Raise UserError for GPUs that no job would use."""
+        super().check()
+        if self.gpus > self.jobs_per_task:
+            raise UserError(
+                f"--gpus {self.gpus} is more than --jobs-per-task {self.jobs_per_task}, and a job uses one GPU: raise "
+                "--jobs-per-task or lower --gpus"
+            )
+
 
 @dataclass(frozen=True)
 class RayOptions(Options):
@@ -77,19 +86,13 @@ class RayOptions(Options):
     cpus: float = 1.0
     """CPU cores per job."""
     gpus: float = 1.0
-    """GPUs per job; 0.25 lets four jobs share one."""
+    """GPUs per job, at most 1; 0.25 lets four jobs share one."""
     jobs: int = 0
     """Concurrent jobs; 0: as many as the current nodes fit. Set it explicitly for an autoscaling cluster."""
     stack: int = 1
     """Maximum fine-tunings trained together in one process, in the slot of one job."""
 
-    limits: ClassVar[Limits] = {"cpus": (0.01, 4096), "gpus": (0, 64), "jobs": (0, 10**5), "stack": (1, 64)}
-
-    def check(self) -> None:
-        """Raise UserError for fractional GPU counts above 1, which Ray does not support."""
-        super().check()
-        if self.gpus > 1 and self.gpus % 1:
-            raise UserError(f"--gpus is {self.gpus}; above 1 it must be a whole number")
+    limits: ClassVar[Limits] = {"cpus": (0.01, 4096), "gpus": (0, 1), "jobs": (0, 10**5), "stack": (1, 64)}
 
 
 EXECUTORS: dict[str, type[Options]] = {"local": LocalOptions, "slurm": SlurmOptions, "ray": RayOptions}
