@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -13,12 +14,13 @@ from multiprocessing import get_context
 import pytest
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_sweeps import begun, job, keep_plan, until
+from tests.helpers_sweeps import RECORD, begun, job, keep_plan, until
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import TEMPORARY, DiskFullError, UserError
+from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.sweeps import driver
-from vd4rl_pomdp.sweeps.driver import Driver
-from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished, lost_among
+from vd4rl_pomdp.sweeps.driver import Driver, Place
+from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished, lost_among, status
 from vd4rl_pomdp.sweeps.options import JOB_VARIABLE, LocalOptions
 
 
@@ -177,6 +179,14 @@ def test_second_signal_does_not_kill_a_job(monkeypatch):
     assert end() == (143, "a checkpoint is written\n")
 
 
+def test_joined_driver_reports_left_work_by_its_exit_code(tmp_path):
+    keep_plan(tmp_path, job(tmp_path, "bad", ends=(2,)))
+    with pytest.raises(SystemExit, match="1"):
+        main(["sweep", "join", str(tmp_path)])
+    (tmp_path / "sweep" / "attempts.jsonl").unlink()
+    main(["sweep", "join", str(tmp_path)])
+
+
 def test_joined_driver_ends_when_no_job_can_start(tmp_path):
     one, _ = jobs = [job(tmp_path, "one", ends=("wait",)), job(tmp_path, "after", "one")]
     keep_plan(tmp_path, *jobs)
@@ -232,6 +242,10 @@ def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
     assert sorted(place.gpu for place in driver.places(LocalOptions(jobs_per_gpu=3))) == ["2"] * 3 + ["5"] * 3
     with pytest.raises(UserError, match="is more than 2 GPUs take"):
         driver.places(LocalOptions(jobs=3))
+    with monkeypatch.context() as patch:  # as on macOS
+        patch.delattr(os, "sched_getaffinity")
+        patch.setattr(os, "cpu_count", lambda: 8)
+        assert [(len(place.cores), place.pinned) for place in driver.places(LocalOptions())] == [(4, False)] * 2
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     one, before = job(tmp_path, "one"), os.sched_getaffinity(0)
     sweep(tmp_path, one)
@@ -241,12 +255,71 @@ def test_jobs_divide_cores_and_gpus(tmp_path, monkeypatch):
     assert os.sched_getaffinity(0) == before
 
 
+def test_jobs_prefer_the_least_busy_gpu(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "places", lambda _: [Place((0,), gpu, pinned=False) for gpu in "0011"])
+    jobs = [job(tmp_path, name) for name in "ab"]
+    assert sweep(tmp_path, *jobs)
+    assert {begun(one)[0]["CUDA_VISIBLE_DEVICES"] for one in jobs} == {"0", "1"}
+
+
 @pytest.mark.parametrize(("threads", "expected"), [(0, "7"), (3, "3")])
 def test_job_threads_come_from_the_flag_then_the_environment(tmp_path, monkeypatch, threads, expected):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     one = job(tmp_path, "one")
     assert Driver([keep_plan(tmp_path, one)], LocalOptions(threads=threads), SweepFolder(tmp_path)).run()
     assert begun(one)[0]["OMP_NUM_THREADS"] == expected
+
+
+def test_failure_counts_while_its_row_cannot_be_written(tmp_path, monkeypatch, capsys):
+    bad, _ = jobs = [job(tmp_path, "bad", ends=(1,) * 9), job(tmp_path, "slow", ends=("wait",))]
+    add, tries = SweepFolder.add, []
+
+    def full(folder, row):
+        tries.append(row)
+        if len(tries) == 1:
+            (tmp_path / "go").touch()
+            raise DiskFullError("the disk is full")
+        add(folder, row)
+
+    monkeypatch.setattr(SweepFolder, "add", full)
+    assert not sweep(tmp_path, *jobs)
+    assert len(begun(bad)) == 1
+    assert capsys.readouterr().err.count("warning: the disk is full") == 1
+    assert [causes(tmp_path, one) for one in jobs] == [["failed"], ["done"]], "both are written in the end"
+
+
+def attempt(one, ended, seconds, cause="done"):
+    return {"job": one.name, "cause": cause, "line": "", "words": one.words, "ended": ended, "seconds": seconds}
+
+
+@pytest.mark.parametrize(("ends", "seconds", "per_hour"), [
+    ([0.0, *(86400 + 30.0 * n for n in range(10))], 30, 120),  # after a pause of a day
+    ([10800.0 * n for n in range(3)], 10800, 1 / 3),
+    ([10800.0, 10800, 21600, 21600], 10800, 2 / 3),  # two at a time
+])  # fmt: skip
+@pytest.mark.parametrize("repeated", [False, True])
+def test_time_left_follows_the_last_finished_jobs(tmp_path, ends, seconds, per_hour, repeated):
+    now = time.time()
+    made, left = ([job(tmp_path, f"{kind}{n}") for n in range(len(ends))] for kind in ("made", "left"))
+    rows = {
+        one.name: [attempt(one, now - ends[-1] + end, seconds)] * (1 + repeated)
+        for one, end in zip(made, ends, strict=True)
+    }
+    for one in made:
+        write_json(one.folder / "config.json", RECORD)
+        write_json(one.folder / "timing.json", {})
+    found = status([*made, *left], rows | {one.name: [] for one in left})
+    assert found["counts"] == {"done": len(ends), "waiting": len(ends)}
+    assert found["per_hour"] == pytest.approx(per_hour)
+    assert found["seconds_left"] == pytest.approx(len(ends) * 3600 / per_hour)
+
+
+def test_relative_and_absolute_commands_share_attempts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one = replace(job(tmp_path, "one"), words=["pretrain", "--out", "runs/one"])
+    SweepFolder(tmp_path).add(attempt(one, 2.0, 1.0, "failed"))
+    for out, number in (("runs/one", 1), (f"{tmp_path}/runs/one", 1), ("runs/other", 0)):
+        assert len(causes(tmp_path, replace(one, words=["pretrain", "--out", out]))) == number
 
 
 def test_row_after_a_truncated_row_is_complete(tmp_path, monkeypatch):
@@ -277,7 +350,12 @@ def test_moved_plan_is_readable_but_not_executed(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     main(["sweep", "status", "moved"])
     assert "1 jobs: 1 done" in capsys.readouterr().out
-    assert "error: moved: was planned as " in rejection(["sweep", "retry", "moved"])
+    old = "error: moved: was planned as .*: move it back, or remove moved/sweep/plans/plan.json and plan it again with"
+    assert re.match(old, rejection(["sweep", "retry", "moved"]))
+    keep_plan(tmp_path / "moved", job(tmp_path / "moved", "one"), name="new")
+    assert re.match(old, rejection(["sweep", "join", "moved"]))
+    (tmp_path / "moved" / "sweep" / "plans" / "plan.json").unlink()
+    main(["sweep", "retry", "moved"])
 
 
 @pytest.mark.parametrize("text", ["[{", "{}", "[3]", '{"made_in": "/", "out": "runs", "program": [], "jobs": [{}]}'])

@@ -221,6 +221,8 @@ def join(
     folder = folders.SweepFolder(out)
     finished = driver.Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
     print("all jobs are finished" if finished else "no job can start now; `sweep status` shows what is left")
+    if not finished:
+        sys.exit(1)
 
 
 @command

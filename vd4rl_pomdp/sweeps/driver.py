@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,6 +87,8 @@ class Driver:
         self._busy = time.monotonic()  # time at which something last ran
         self._ends = False
         """Whether it terminates its jobs."""
+        self._unwritten: list[Row] = []
+        """Rows of attempts that a full disk did not take yet."""
         self._widths: dict[str, int | None] = {}
         """Feature width by fine-tuning job, known once its encoder exists."""
 
@@ -115,6 +118,8 @@ class Driver:
     def _start_ready(self) -> bool:
         """Start all jobs that can start. Return whether there is anything left to wait for."""
         attempts = self._folder.attempts(self._jobs.values())  # includes other drivers' attempts
+        for row in self._unwritten:
+            attempts[row["job"]].append(row)
         lost = lost_among(self._left.values(), attempts)
         running = {job.name for one in self._running for job in one.jobs}
         ready = []
@@ -176,7 +181,8 @@ class Driver:
 
     def _begin(self, jobs: list[Job], spare: int) -> None:
         """Start a process for some jobs. A stack takes one place per job, if spare, for its parallel evaluations."""
-        log, gpu = self._log(jobs[0]), self._free[0].gpu
+        log = self._log(jobs[0])
+        ((gpu, _),) = Counter(place.gpu for place in self._free).most_common(1)  # the least busy one
         taken = [place for place in self._free if place.gpu == gpu][: max(1, min(len(jobs), 1 + spare))]
         place = replace(taken[0], cores=tuple(sorted({core for one in taken for core in one.cores})))
         try:
@@ -225,8 +231,11 @@ class Driver:
             if how in PASSING:
                 self._not_before[job.name] = time.monotonic() + PAUSE_S
             row: Row = {"job": job.name, "cause": how, "line": why, "words": job.words} | shared
+            self._unwritten.append(row)
             try:
-                self._folder.add(row)
+                while self._unwritten:
+                    self._folder.add(self._unwritten[0])
+                    del self._unwritten[0]
             except UnavailableError as error:
                 print(f"warning: {error}", file=sys.stderr)
             say(row, len(self._jobs) - len(self._left), len(self._jobs))
@@ -245,13 +254,12 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
         own["OMP_NUM_THREADS"] = str(threads or max(1, len(place.cores)))
     own |= {} if place.gpu is None else {"CUDA_VISIBLE_DEVICES": place.gpu}
     program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: do not import from the working directory
-    pinned = place.pinned and bool(place.cores)
-    mine = os.sched_getaffinity(0) if pinned else set()
+    mine = os.sched_getaffinity(0) if place.pinned else set()
     # A child inherits affinity and blocked signals. Slurm sends its time-limit warning to every process; only the task
     # itself should react, and then terminate its jobs.
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2})
     try:
-        if pinned:
+        if place.pinned:
             os.sched_setaffinity(0, place.cores)
         with log.open("ab") as file:
             return subprocess.Popen(
@@ -264,7 +272,7 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
                 start_new_session=True,  # the driver handles Ctrl-C
             )
     finally:
-        if pinned:
+        if place.pinned:
             os.sched_setaffinity(0, mine)
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
@@ -298,14 +306,15 @@ def places(options: LocalOptions) -> list[Place]:
             f"--jobs {jobs} is more than {len(gpus)} GPUs take with --jobs-per-gpu {options.jobs_per_gpu}: "
             "raise that, or set CUDA_VISIBLE_DEVICES to nothing to run on the CPU"
         )
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    binds = hasattr(os, "sched_getaffinity")  # not on macOS
+    cores = sorted(os.sched_getaffinity(0)) if binds else list(range(os.cpu_count() or 1))
     granted = int(os.environ.get("SLURM_CPUS_PER_TASK", len(cores)))
-    pinned = granted >= len(cores)  # else Slurm binds no cores, and other tasks would get the same ones
+    pinned = binds and granted >= len(cores)  # else Slurm binds no cores, and other tasks would get the same ones
     cores = cores[:granted]
     found = []
     for number in range(jobs):
         first, end = (place * len(cores) // jobs for place in (number, number + 1))
-        share = tuple(cores[first : max(end, first + 1)])  # at least one, if any are known
+        share = tuple(cores[first : max(end, first + 1)])  # at least one
         found.append(Place(share, gpus[number % len(gpus)] if gpus else None, pinned))
     return found
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -37,7 +36,7 @@ PASSING = (KILLED, UNAVAILABLE)
 TRIES = 5  # consecutive transient failures after which a job counts as failed
 _RETRIED = "retried"  # cause of the row that clears a job's earlier failures
 RUNNING, WAITING, BLOCKED = "running", "waiting", "blocked"
-_RATE_S = 3600.0  # window in seconds over which the rate of finished jobs is measured
+_RECENT = 20  # finished jobs over which the rate is measured, or more if more are running
 
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
@@ -76,6 +75,21 @@ class SweepFolder:
 
         UserError if no plan is there, or one is damaged.
         """
+        return list(self._plans(name).values())
+
+    def plans_to_do(self, name: str = "") -> list[Plan]:
+        """Like `plans`; UserError if the folder was moved, since the jobs' commands still name the old place."""
+        plans = self._plans(name)
+        for path, plan in plans.items():
+            if (plan.made_in / plan.out).resolve() != self.out.resolve():
+                raise UserError(
+                    f"{self.out}: was planned as {plan.made_in / plan.out}: move it back, or remove {path} and plan it "
+                    f"again with `sweep run GRID --out {self.out}`"
+                )
+        return list(plans.values())
+
+    def _plans(self, name: str) -> dict[Path, Plan]:
+        """See `plans`; by file."""
         paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
         if not paths:
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
@@ -84,21 +98,11 @@ class SweepFolder:
             inside = folder.is_relative_to(plan.out)  # else a set that lies elsewhere
             return self.out / folder.relative_to(plan.out) if inside else plan.made_in / folder
 
-        plans = map(read_plan, paths)
-        return [
-            replace(plan, jobs=[replace(job, folder=here(plan, job.folder)) for job in plan.jobs]) for plan in plans
-        ]
-
-    def plans_to_do(self, name: str = "") -> list[Plan]:
-        """Like `plans`; UserError if the folder was moved, since the jobs' commands still name the old place."""
-        plans = self.plans(name)
-        for plan in plans:
-            if (plan.made_in / plan.out).resolve() != self.out.resolve():
-                raise UserError(
-                    f"{self.out}: was planned as {plan.made_in / plan.out}: move it back, or plan it again with `sweep "
-                    f"run GRID --out {self.out}`"
-                )
-        return plans
+        plans = {path: read_plan(path) for path in paths}
+        return {
+            path: replace(plan, jobs=[replace(job, folder=here(plan, job.folder)) for job in plan.jobs])
+            for path, plan in plans.items()
+        }
 
     def jobs_of_others(self, name: str) -> list[Job]:
         """The jobs of all plans except `name`, as written."""
@@ -133,11 +137,16 @@ class SweepFolder:
                 if row["cause"] == _RETRIED:
                     rows.clear()
                 # Attempts at an older command do not count.
-                elif row["words"] == words[row["job"]] and row.keys() >= {"ended", "seconds", "line"}:
+                elif _same(row["words"], words[row["job"]]) and row.keys() >= {"ended", "seconds", "line"}:
                     rows.append(row)
             except (ValueError, TypeError, KeyError):
                 continue
         return found
+
+
+def _same(words: list[str], others: list[str]) -> bool:
+    """Whether two commands are equal, apart from whether they name a folder by its absolute path."""
+    return words == others or list(map(os.path.abspath, words)) == list(map(os.path.abspath, others))
 
 
 def read_plan(path: Path) -> Plan:
@@ -182,9 +191,9 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
     """Progress of a sweep.
 
     Returns:
-        counts: jobs by state. per_hour: rate over the last hour, or since the sweep began. seconds_left: at that rate;
-            None if it is 0. finished: whether nothing is left. states: by job name, done, running, waiting, failed, or
-            blocked by a failed dependency. failures: the last attempt of every failed job.
+        counts: jobs by state. per_hour: rate of the last finished jobs, without pauses; 0 if there are none.
+            seconds_left: at that rate; None if it is 0. finished: whether nothing is left. states: by job name, done,
+            running, waiting, failed, or blocked by a failed dependency. failures: the last attempt of every failed job.
     """
     left = [job for job in jobs if not is_finished(job)]
     lost = lost_among(left, attempts)
@@ -193,10 +202,10 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
         here = RUNNING if in_use(job.folder) else FAILED if failed(attempts[job.name]) else WAITING
         states[job.name] = BLOCKED if here == WAITING and job.name in lost else here
     to_do = sum(state in (RUNNING, WAITING) for state in states.values())
-    tried, now = [row for rows in attempts.values() for row in rows], time.time()
-    began = min((row["ended"] - row["seconds"] for row in tried), default=now)
-    span = min(_RATE_S, max(now - began, 1.0))
-    per_hour = sum(row["cause"] == DONE and now - row["ended"] <= span for row in tried) * 3600 / span
+    made = [rows for rows in attempts.values() if any(row["cause"] == DONE for row in rows)]
+    number = max(_RECENT, 2 * sum(state == RUNNING for state in states.values()))
+    recent = sorted(made, key=lambda rows: rows[-1]["ended"])[-number:]
+    per_hour = len(recent) * 3600 / max(1.0, _seconds_of([row for rows in recent for row in rows]))
     return {
         "counts": dict(Counter(states.values())),
         "per_hour": per_hour,
@@ -205,6 +214,15 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
         "states": states,
         "failures": {name: attempts[name][-1] for name, state in states.items() if state == FAILED},
     }
+
+
+def _seconds_of(attempts: list[Row]) -> float:
+    """Seconds in which at least one of some attempts ran."""
+    seconds = until = 0.0
+    for row in sorted(attempts, key=lambda row: row["ended"] - row["seconds"]):
+        seconds += max(0.0, row["ended"] - max(until, row["ended"] - row["seconds"]))
+        until = max(until, row["ended"])
+    return seconds
 
 
 def failure(row: Row, out: Path) -> str:
