@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing import get_context
 
@@ -286,6 +287,14 @@ def test_failure_counts_while_its_row_cannot_be_written(tmp_path, monkeypatch, c
     assert len(begun(bad)) == 1
     assert capsys.readouterr().err.count("warning: the disk is full") == 1
     assert [causes(tmp_path, one) for one in jobs] == [["failed"], ["done"]], "both are written in the end"
+
+
+def test_sweep_outlives_a_full_disk_under_its_log(tmp_path, monkeypatch):
+    finished = None
+    with suppress(OSError), open("/dev/full", "w", buffering=1) as full, monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", full)
+        finished = sweep(tmp_path, job(tmp_path, "one", ends=(TEMPORARY,)))
+    assert finished
 
 
 def attempt(one, ended, seconds, cause="done"):

@@ -13,7 +13,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import Any
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, first_line
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.outputs import in_use
-from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, say
+from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, note, say
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
@@ -104,7 +103,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                 # Fail on the first contact. Later, keep trying: a rejection may pass, and must not end running tasks.
                 if not heard or (isinstance(error, RejectedError) and not live and vain == VAIN):
                     raise
-                print(f"warning: {error}; trying again", file=sys.stderr, flush=True)
+                note(f"warning: {error}; trying again")
             until = time.monotonic() + LOOK_S
             while time.monotonic() < until:
                 time.sleep(0.5)
@@ -163,7 +162,7 @@ class SlurmCluster:
                 time.sleep(1)
             self._ask("scancel", "--quiet")
         except UnavailableError as error:
-            print(f"warning: {error}; tasks may still be running: scancel --me --name={self._name}", file=sys.stderr)
+            note(f"warning: {error}; tasks may still be running: scancel --me --name={self._name}")
 
     def _ask(self, command: str, *words: str) -> str:
         """Stdout of a Slurm command on this sweep's tasks; UnavailableError if it fails or times out."""
@@ -247,7 +246,7 @@ class RayCluster:
                 self._ray.get(task)
             except self._ray.exceptions.RayError as error:
                 reason = first_line(getattr(error, "cause", None) or error)
-                print(f"warning: a task ended ({reason})", file=sys.stderr, flush=True)
+                note(f"warning: a task ended ({reason})")
         return len(self._running)
 
     def submit(self, task: ClusterTask, number: int) -> None:

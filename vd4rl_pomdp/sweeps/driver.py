@@ -16,6 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -237,7 +238,7 @@ class Driver:
                     self._folder.add(self._unwritten[0])
                     del self._unwritten[0]
             except UnavailableError as error:
-                print(f"warning: {error}", file=sys.stderr)
+                note(f"warning: {error}")
             say(row, len(self._jobs) - len(self._left), len(self._jobs))
 
 
@@ -294,7 +295,13 @@ def _line_of_end(log: Path, start: int) -> str:
 def say(row: Row, done: int, of: int) -> None:
     """Print the result of an attempt."""
     line = f"[{done}/{of}] {row['cause']:<11} {row['seconds']:6.0f} s  {row['job']}"
-    print(line + (f": {row['line']}" if row["line"] else ""), file=sys.stderr, flush=True)
+    note(line + (f": {row['line']}" if row["line"] else ""))
+
+
+def note(line: str) -> None:
+    """Print a line to stderr. A full disk under the driver's own log must not end the sweep."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def places(options: LocalOptions) -> list[Place]:
