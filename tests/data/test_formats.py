@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import gymnasium
@@ -37,12 +38,6 @@ from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.plan import DataSet, plan_jobs
 
 LENGTHS = [20, 25, 9]
-KEYS = [
-    ("image", (84, 84, 3), np.uint8),
-    ("action", (6,), np.float32),
-    *((key, (), np.float64) for key in ("reward", "discount", "is_first", "is_last", "is_terminal")),
-]
-"""An episode's arrays in V-D4RL's .npz files: name, shape of a row, dtype."""
 BOUNDS = np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32)
 
 
@@ -234,7 +229,6 @@ def test_minari_relative_paths_and_damaged_metadata(minari, tmp_path, monkeypatc
         ({"action": np.zeros((5, 3), np.float32)}, "unlike the episodes before"),
         ({"image": np.zeros((5, 84, 84, 3), np.float32)}, "float32 images"),
         ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "images of 32x32 pixels, its dataset declares 84x84"),
-        *(({key: np.zeros((n, *of), kind) for key, of, kind in KEYS}, "has no step") for n in (0, 1)),
     ],
 )
 def test_import_of_damaged_episode_leaves_nothing(changed, message, tmp_path):
@@ -280,6 +274,23 @@ def test_minari_export_notes_losses(minari, tmp_path, capsys):
         import_set("minari", "test/none-v0", tmp_path / "set")
 
 
+@pytest.mark.parametrize("name", ["vd4rl", "vd4rl_npz", "lerobot", "lerobot_video", "minari"])
+def test_single_row_episodes_are_kept_or_noted(minari, tmp_path, capsys, name):
+    if name.startswith("lerobot"):
+        pytest.importorskip("pyarrow")
+        pytest.importorskip("av")
+    source = own = write_fake_set(tmp_path / "own", [1, 5, 1, 6], attributes={"task": "walker_walk"})
+    if name != "vd4rl":
+        export_set(name, own, source := tmp_path / "a-v0")
+    noted = "episodes of a single row are left out" in capsys.readouterr().err
+    import_set(name, str(source), tmp_path / "back")
+    back, lengths = rows_of_set(tmp_path / "back"), [5, 6] if name == "minari" else [1, 5, 1, 6]
+    assert np.diff(np.flatnonzero(back["step_type"] == StepType.FIRST), append=sum(lengths)).tolist() == lengths
+    assert noted == (name == "minari")
+    if not noted:
+        assert_equal_rows(rows_of_set(own), back, but=["observation"] if name == "lerobot_video" else [])
+
+
 def write_ogbench(path, episodes):
     """Write (T + 1, 64, 64, 3) images and (T + 1, A) actions as OGBench's generation scripts do."""
     pictures, actions = ([one[part] for one in episodes] for part in (0, 1))
@@ -320,7 +331,6 @@ EPISODE = np.zeros((4, 64, 64, 3), np.uint8), np.zeros((4, 2), np.float32)
     [
         ([EPISODE] * 2, {"actions": np.zeros((4, 2))}, "has 8 images, 4 actions and 8 terminals"),
         ([EPISODE] * 2, {"terminals": np.zeros(4)}, "has 8 images, 8 actions and 4 terminals"),
-        ([tuple(part[:1] for part in EPISODE)], {}, "episode 0: has no step"),
         ([(np.zeros((3, 28), np.float32), np.zeros((3, 5), np.float32))], {}, "holds no images"),
         ([EPISODE], None, "cannot be read as this format"),
     ],
@@ -392,10 +402,16 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     assert_equal_rows(rows_of_set(tmp_path / "own"), small, but=["observation"])
 
 
-def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch):
+@pytest.mark.parametrize("shortest", [1, 8])
+def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch, shortest):
     folder = write_fake_set(tmp_path / "own", [7, 9, 8, 12, 5], attributes={"task": "walker_walk"})
     monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 20)
-    whole = import_set("vd4rl", str(folder), tmp_path / "whole")
+    whole = import_set("vd4rl", str(folder), tmp_path / "whole", shortest=shortest)
+    kept = [number for number, length in enumerate([7, 9, 8, 12, 5]) if length >= shortest]
+    assert (
+        rows_of_set(tmp_path / "whole")["observation"][:, 0, 0, 0].tolist()
+        == np.repeat(kept, [[7, 9, 8, 12, 5][number] for number in kept]).tolist()
+    )
     written = []
 
     def write(path, rows, attributes):
@@ -407,13 +423,55 @@ def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("vd4rl_pomdp.data.shards.write_shard", write)
         with pytest.raises(KeyboardInterrupt):
-            import_set("vd4rl", str(folder), tmp_path / "set")
+            import_set("vd4rl", str(folder), tmp_path / "set", shortest=shortest)
     with pytest.raises(UserError, match="collection is not finished"):
         open_dataset(tmp_path / "set")
     changed = written[0].stat().st_mtime_ns
-    shards = import_set("vd4rl", str(folder), tmp_path / "set")
+    shards = import_set("vd4rl", str(folder), tmp_path / "set", shortest=shortest)
     assert written[0].stat().st_mtime_ns == changed
     assert [shard.read_bytes() for shard in shards] == [shard.read_bytes() for shard in whole]
+
+
+def test_shards_of_large_frames_have_fewer_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 24)
+    episodes = [fake_episode(number, 6) for number in range(4)]
+    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
+    for size, shards in ((84, 1), (240, 4)):
+        rows["observation"] = np.zeros((24, 3, size, size), np.uint8)
+        own = write_rows(tmp_path / str(size), rows, {"task": "walker_walk"})
+        assert len(import_set("vd4rl", str(own), tmp_path / f"set{size}")) == shards
+
+
+def test_import_holds_two_shards_at_most(tmp_path, monkeypatch):
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 200)
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer.write_card", lambda out: None)  # it imports matplotlib
+    episodes = [fake_episode(number % 8, 20) for number in range(40)]
+    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
+    export_set("vd4rl_npz", write_rows(tmp_path / "own", rows), tmp_path / "npz")
+    del rows, episodes
+    tracemalloc.start()
+    try:
+        assert len(import_set("vd4rl_npz", str(tmp_path / "npz"), tmp_path / "set")) == 4
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2.5 * 200 * 3 * 84**2
+
+
+def test_short_episodes_are_left_out(tmp_path, own_cache, capsys):
+    own = write_fake_set(tmp_path / "own", [20, 5, 25, 1], attributes={"task": "walker_walk"})
+    with pytest.raises(UserError, match=r"holds no episodes of 26 or more rows"):
+        import_set("vd4rl", str(own), tmp_path / "none", shortest=26)
+    main(["data", "import", "vd4rl", str(own), str(tmp_path / "set"), "--shortest", "8"])
+    stderr = capsys.readouterr().err
+    assert "2 episodes of fewer than 8 rows are left out" in stderr
+    assert "2 episodes are shorter than pretraining's default window of 32 rows" in stderr
+    assert "pretrain with --window 20" in stderr
+    rows = rows_of_set(own)
+    assert_equal_rows(
+        {key: np.concatenate([v[:20], v[25:50]]) for key, v in rows.items()}, rows_of_set(tmp_path / "set")
+    )
+    assert pretrain(smoke_pretrain(tmp_path / "set", tmp_path / "run")).finished
 
 
 def test_interrupted_export_leaves_nothing(tmp_path, monkeypatch):

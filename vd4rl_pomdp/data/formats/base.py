@@ -19,9 +19,8 @@ from vd4rl_pomdp.data.shards import EpisodeArrays
 class SourceSet:
     """An opened data set whose episodes are read one at a time."""
 
-    episodes: int
-    rows: int
-    """Total number of rows, which may be approximate; it determines how many episodes go into a shard."""
+    lengths: list[int]
+    """Rows of every episode."""
     frame_shape: tuple[int, int]
     """Height and width of the pictures."""
     read: Callable[[int], Iterator[EpisodeArrays]]

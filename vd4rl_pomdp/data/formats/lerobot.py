@@ -82,7 +82,7 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
     size = sum(file.stat().st_size for file in {*data, *films})
     record = {"set": folder.resolve().name, "picture": key, "bytes": size}
     quality = (features[_OWN].get("info") or {}).get("quality") if own else None
-    return SourceSet(len(lengths), sum(lengths), shape, read, record, low, high, named, quality, notes)
+    return SourceSet(lengths, shape, read, record, low, high, named, quality, notes)
 
 
 def _info(folder: Path) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def _rows(stored: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> Episo
 
 def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = False) -> list[str]:
     """Write a data set for `LeRobotDataset(NAME, root=FOLDER)`, with images as PNG in the rows or as H.264 videos."""
-    size, end, files = source.frame_shape[0], 0, 0
+    size, end, files, total = source.frame_shape[0], 0, 0, sum(source.lengths)
     if video and size % 2:
         raise UserError(f"video needs an even height and width, not {size}: pass --size, or use the format `lerobot`")
     held, index, changes = list[Any](), list[dict[str, Any]](), list[tuple[float, int]]()
@@ -235,7 +235,7 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
         for name, values in (columns | {_PICTURE: rows[FRAMES_KEY][::10]}).items():
             place |= {f"stats/{name}/{kind}": value for kind, value in _stats(values).items()}
         index.append(place)
-        if end == source.rows or sum(table.nbytes for table in held) >= _FILE_MB * 2**20:
+        if end == total or sum(table.nbytes for table in held) >= _FILE_MB * 2**20:
             _save(folder / _DATA.format(**_numbered("", files)), held)
             held, files = [], files + 1
     _save(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", [_arrow().Table.from_pylist(index)])

@@ -73,8 +73,7 @@ def read(source: str, picture: str | None) -> SourceSet:
 
     bounded = not discrete and actions.is_bounded()
     return SourceSet(
-        len(lengths),
-        sum(lengths) + len(lengths),
+        [steps + 1 for steps in lengths],
         size,
         lambda first: map(episode, range(first, len(lengths))),
         {"id": dataset.id, "picture": key, "steps": sum(lengths), "minari": dataset.minari_version},

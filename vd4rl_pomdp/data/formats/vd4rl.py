@@ -6,9 +6,9 @@ An episode's file holds `image` (T + 1, S, S, 3) uint8, `action`, `reward`, `dis
 
 from __future__ import annotations
 
-import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,7 @@ def read_shards(path: str, picture: str | None = None) -> SourceSet:
 
     task, quality = task_and_quality(folder, stored.attributes)
     record = {"set": folder.resolve().name, "bytes": sum(shard.stat().st_size for shard in stored.shards)}
-    return SourceSet(len(ends), int(ends[-1]), (size, size), read, record, task=task, quality=quality)
+    return SourceSet((ends - stored.starts).tolist(), (size, size), read, record, task=task, quality=quality)
 
 
 def read_npz(path: str, picture: str | None = None) -> SourceSet:
@@ -50,10 +50,9 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise UserError(f"{folder}: holds no .npz episodes; name the folder that holds them, such as TASK/QUALITY/64px")
-    shape = _episode(files[0])[FRAMES_KEY].shape
-    _, frame_shape = chosen({"image": shape[1:]}, picture)
-    lengths = [re.search(r"-(\d+)$", file.stem) for file in files]
-    rows = sum(int(length[1]) if length else shape[0] for length in lengths)
+    with _opened(files[0]) as first:
+        _, frame_shape = chosen({"image": first["image"].shape[1:]}, picture)
+    lengths = [_length(file) for file in files]
     (task, quality), notes = task_and_quality(folder, []), []
     if "64px" in folder.resolve().parts and len(files) <= 100 and task and quality:  # V-D4RL's paper states more
         expert = " of the expert only" if quality == "medium_expert" else ""
@@ -64,17 +63,32 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
         ]
     record = {"folder": folder.resolve().name, "bytes": sum(file.stat().st_size for file in files)}
     read = lambda first: map(_episode, files[first:])  # noqa: E731
-    return SourceSet(len(files), rows, frame_shape, read, record, task=task, quality=quality, notes=notes)
+    return SourceSet(lengths, frame_shape, read, record, task=task, quality=quality, notes=notes)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+    """An episode's arrays, each read when accessed."""
+    try:
+        with np.load(path) as file:
+            if missing := [key for key in ("image", "action", "reward") if key not in file]:
+                keys = ", ".join(file)
+                raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {keys})")
+            yield file
+    except UserError:
+        raise
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); download it again") from error
+
+
+def _length(path: Path) -> int:
+    with _opened(path) as file:
+        return len(file["reward"])
 
 
 def _episode(path: Path) -> EpisodeArrays:
-    try:
-        with np.load(path) as file:
-            stored = {key: file[key] for key in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); download it again") from error
-    if missing := [key for key in ("image", "action", "reward") if key not in stored]:
-        raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
+    with _opened(path) as file:
+        stored = dict(file)
     rows = len(stored["reward"])
     for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
         if (count := len(stored.get(key, stored["reward"]))) != rows:
@@ -111,5 +125,7 @@ def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
     return ["simulator states are not kept"] if states else []
 
 
-VD4RL = DataFormat("V-D4RL's HDF5 shards, this package's own format: to change the frame size", read_shards)
+VD4RL = DataFormat(
+    "V-D4RL's HDF5 shards, this package's own format: to change the frame size or drop short episodes", read_shards
+)
 VD4RL_NPZ = DataFormat("V-D4RL's 64-pixel .npz episodes, in DreamerV2's layout", read_npz, write_npz)
