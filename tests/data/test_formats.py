@@ -364,7 +364,9 @@ def test_minari_arrays_of_unequal_length_are_rejected(minari, key, tmp_path):
 def test_npz_round_trip_loses_only_physics(tmp_path, capsys):
     folder = write_fake_set(tmp_path / "walker_walk" / "expert", LENGTHS, complete_last=False, physics_dim=18)
     main(["data", "export", "vd4rl_npz", str(folder), str(tmp_path / "npz")])
-    assert "simulator states" in capsys.readouterr().err
+    stderr = capsys.readouterr().err
+    assert "simulator states" in stderr
+    assert "task and quality are not stored: import with --task walker_walk and --quality expert" in stderr
     names = sorted(os.listdir(tmp_path / "npz"))
     assert [name.rpartition("-")[2] for name in names] == [f"{length}.npz" for length in LENGTHS]
     with np.load(tmp_path / "npz" / names[0]) as first:
@@ -372,6 +374,66 @@ def test_npz_round_trip_loses_only_physics(tmp_path, capsys):
         assert [first[key].nonzero()[0].tolist() for key in ("is_first", "is_last", "is_terminal")] == [[0], [19], []]
     main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "cheetah_run")])
     assert_equal_rows(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
+
+
+def rewrite_npz(folder, change):
+    """Export a set of two episodes as .npz files, with `change` made to each one's arrays, and return both sets."""
+    own, npz = (folder / name / "walker_walk" / "expert" for name in ("own", "npz"))
+    export_set("vd4rl_npz", write_fake_set(own, [5, 6]), npz)
+    for file in npz.iterdir():
+        with np.load(file) as stored:
+            arrays = dict(stored)
+        np.savez(file, **(arrays | change(arrays)))
+    return own, npz
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: {"image": one["image"] / np.float32(255)}, "episode 0: has float32 images, expected uint8"),
+        (lambda one: {"image": np.repeat(one["image"][..., :1], 4, -1)}, "holds no images: expected uint8"),
+        (lambda one: {"is_first": np.arange(len(one["reward"])) % 3 == 0}, "'is_first' is true in the middle"),
+        (lambda one: {"is_last": np.arange(len(one["reward"])) % 3 == 2}, "'is_last' is true in the middle"),
+    ],
+)
+def test_npz_of_other_layouts_is_rejected(tmp_path, change, message):
+    _, npz = rewrite_npz(tmp_path, change)
+    with pytest.raises(UserError, match=message):
+        import_set("vd4rl_npz", str(npz), tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda one: {"discount": one["discount"].astype(np.int64)},
+        lambda one: {"discount": one["discount"].astype(bool)},
+        lambda one: {"action": one["action"][:, 0]},
+    ],
+)
+def test_npz_of_other_dtypes_and_shapes_is_read(tmp_path, capsys, change):
+    own, npz = rewrite_npz(tmp_path, change)
+    assert "not stored" not in capsys.readouterr().err, "the folder's name states the task"
+    import_set("vd4rl_npz", str(npz), tmp_path / "set")
+    rows, given = rows_of_set(tmp_path / "set"), rows_of_set(own)
+    given["action"] = given["action"][:, : rows["action"].shape[1]]
+    assert_equal_rows(given, rows)
+
+
+@pytest.mark.parametrize(
+    ("stack", "grey"),
+    [
+        (lambda frames: np.stack([0 * frames, 0 * frames, 0 * frames, frames], 1), False),
+        (lambda frames: np.stack([0 * frames, frames], 1).transpose(0, 1, 3, 4, 2), False),
+        (lambda frames: np.concatenate([0 * frames, frames[:, 2:]], 1), True),
+        (lambda frames: np.stack([0 * frames, frames], 1)[:, :, 2:].transpose(0, 1, 3, 4, 2), True),
+    ],
+)
+def test_newest_frame_of_a_stack_is_kept(tmp_path, stack, grey):
+    own, npz = rewrite_npz(tmp_path, lambda one: {"image": stack(one["image"].transpose(0, 3, 1, 2))})
+    import_set("vd4rl_npz", str(npz), tmp_path / "set")
+    newest = rows_of_set(own)["observation"]
+    newest = np.repeat(newest[:, 2:], 3, 1) if grey else newest
+    np.testing.assert_array_equal(rows_of_set(tmp_path / "set")["observation"], newest)
 
 
 def test_published_64_pixel_sets_print_a_note(tmp_path, capsys):

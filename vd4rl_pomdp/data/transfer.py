@@ -176,8 +176,10 @@ class _Reader:
                 found, declared = (f"{height}x{width}" for height, width in (frames.shape[2:], size))
                 raise UserError(f"has images of {found} pixels, its dataset declares {declared}")
             layout = {key: values.shape[1:] for key, values in rows.items()}
-            if frames.dtype != np.uint8 or layout != (self._layout or layout):
-                raise UserError(f"has {frames.dtype} images and rows of {layout}, unlike the episodes before")
+            if frames.dtype != np.uint8:
+                raise UserError(f"has {frames.dtype} images, expected uint8")
+            if layout != (self._layout or layout):
+                raise UserError(f"has rows of {layout}, unlike the episodes before")
             self._layout = layout
             states = {key: values for key, values in rows.items() if key != FRAMES_KEY}
             check_rows(f"{self._name}: episode {number}", states, len(frames))

@@ -93,14 +93,18 @@ def _episode(path: Path) -> EpisodeArrays:
     for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
         if (count := len(stored.get(key, stored["reward"]))) != rows:
             raise UserError(f"{path}: {key!r} has {count} rows, 'reward' {rows}; download it again")
+    for key, inner in (("is_first", slice(1, None)), ("is_last", slice(0, -1))):
+        if stored.get(key, np.zeros(1))[inner].any():
+            raise UserError(f"{path}: {key!r} is true in the middle: split it into one file per episode")
     step_type = np.full(rows, StepType.MID, np.int64)
     step_type[-1:] = StepType.LAST if stored.get("is_last", np.ones(1))[-1:].any() else StepType.MID
     step_type[:1] = StepType.FIRST
+    action, ended = stored["action"], stored.get("is_terminal", np.zeros(rows))
     return {
         FRAMES_KEY: as_frames(stored["image"]),
-        "action": stored["action"],
+        "action": action[:, None] if action.ndim == 1 else action,
         "reward": stored["reward"].astype(float),
-        "discount": stored["discount"] if "discount" in stored else 1.0 - stored.get("is_terminal", np.zeros(rows)),
+        "discount": stored["discount"].astype(float) if "discount" in stored else 1.0 - ended,
         "step_type": step_type,
     }
 
@@ -122,7 +126,12 @@ def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
             is_last=step_type == StepType.LAST,
             is_terminal=rows["discount"] == 0,
         )
-    return ["simulator states are not kept"] if states else []
+    lost = ["simulator states are not kept"] if states else []
+    names = {"task": source.task, "quality": source.quality}
+    if any(name and name != found for name, found in zip(names.values(), task_and_quality(out, []), strict=True)):
+        flags = " and ".join(f"--{key} {name}" for key, name in names.items() if name)
+        lost.append(f"task and quality are not stored: import with {flags}, or name the folder TASK/QUALITY/64px")
+    return lost
 
 
 VD4RL = DataFormat(
