@@ -267,11 +267,18 @@ def test_minari_export_notes_losses(minari, tmp_path, capsys):
     stderr = capsys.readouterr().err
     assert "episodes of a single row" in stderr
     assert "discounts other than" in stderr
-    with pytest.raises(UserError, match="call the folder walker-v0"):
+    with pytest.raises(UserError, match="accept the name 'walker': end it in a version, as in walker-v0"):
         export_set("minari", folder, tmp_path / "walkers" / "walker")
     assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
     with pytest.raises(UserError, match="test/none-v0: is neither a Minari folder nor an installed Minari dataset"):
         import_set("minari", "test/none-v0", tmp_path / "set")
+
+
+@pytest.mark.parametrize("name", ["q/exp-v0", "my set/walker-v0", "walker"])
+def test_names_that_minari_refuses_are_rejected(minari, tmp_path, name):
+    folder = write_fake_set(tmp_path / "own", [4])
+    with pytest.raises(UserError, match=f"Minari does not accept the name '{name}': .* at least two characters before"):
+        export_set("minari", folder, tmp_path / "minari" / name)
 
 
 @pytest.mark.parametrize("name", ["vd4rl", "vd4rl_npz", "lerobot", "lerobot_video", "minari"])
