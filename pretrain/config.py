@@ -14,6 +14,7 @@ from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, flag_of, r
 from vd4rl_pomdp.core.hardware import Precision
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
+from vd4rl_pomdp.core.types import WINDOW
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE
 from vd4rl_pomdp.nn.memory import MEMORIES
@@ -47,7 +48,7 @@ class TrainingConfig(StageConfig):
     """Gradient steps."""
     batch_size: int = 16
     """Windows per batch."""
-    window: int = 32
+    window: int = WINDOW
     """Rows per window."""
     learning_rate: float = 3e-4
     """Adam learning rate."""

@@ -84,6 +84,14 @@ def test_invalid_actions_rewards_and_discounts_are_rejected(tmp_path, row, key, 
         check_dataset(folder, tmp_path / "cache")
 
 
+def test_maze_without_action_repeat_cannot_be_replayed(tmp_path):
+    maze = {"task": "no_curtain"}
+    folder = write_fake_set(tmp_path / "maze", (4,), action_dim=2, physics_dim=4, attributes=maze)
+    report = check_dataset(folder, tmp_path / "cache")
+    assert report["replay_max_error"] is None
+    assert report["replay"] == "impossible: its shards do not state the action repeat"
+
+
 @pytest.mark.parametrize(("action_dim", "physics"), [(6, 0.0), (4, 0.0), (6, 1e30)])
 def test_physics_of_another_simulator_is_rejected(tmp_path, action_dim, physics):
     """Too few state dimensions, too few action dimensions, and a state that makes the simulation diverge."""

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import gymnasium
@@ -37,12 +38,6 @@ from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.plan import DataSet, plan_jobs
 
 LENGTHS = [20, 25, 9]
-KEYS = [
-    ("image", (84, 84, 3), np.uint8),
-    ("action", (6,), np.float32),
-    *((key, (), np.float64) for key in ("reward", "discount", "is_first", "is_last", "is_terminal")),
-]
-"""An episode's arrays in V-D4RL's .npz files: name, shape of a row, dtype."""
 BOUNDS = np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32)
 
 
@@ -234,7 +229,6 @@ def test_minari_relative_paths_and_damaged_metadata(minari, tmp_path, monkeypatc
         ({"action": np.zeros((5, 3), np.float32)}, "unlike the episodes before"),
         ({"image": np.zeros((5, 84, 84, 3), np.float32)}, "float32 images"),
         ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "images of 32x32 pixels, its dataset declares 84x84"),
-        *(({key: np.zeros((n, *of), kind) for key, of, kind in KEYS}, "has no step") for n in (0, 1)),
     ],
 )
 def test_import_of_damaged_episode_leaves_nothing(changed, message, tmp_path):
@@ -273,11 +267,35 @@ def test_minari_export_notes_losses(minari, tmp_path, capsys):
     stderr = capsys.readouterr().err
     assert "episodes of a single row" in stderr
     assert "discounts other than" in stderr
-    with pytest.raises(UserError, match="call the folder walker-v0"):
+    with pytest.raises(UserError, match="accept the name 'walker': end it in a version, as in walker-v0"):
         export_set("minari", folder, tmp_path / "walkers" / "walker")
     assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
     with pytest.raises(UserError, match="test/none-v0: is neither a Minari folder nor an installed Minari dataset"):
         import_set("minari", "test/none-v0", tmp_path / "set")
+
+
+@pytest.mark.parametrize("name", ["q/exp-v0", "my set/walker-v0", "walker"])
+def test_names_that_minari_refuses_are_rejected(minari, tmp_path, name):
+    folder = write_fake_set(tmp_path / "own", [4])
+    with pytest.raises(UserError, match=f"Minari does not accept the name '{name}': .* at least two characters before"):
+        export_set("minari", folder, tmp_path / "minari" / name)
+
+
+@pytest.mark.parametrize("name", ["vd4rl", "vd4rl_npz", "lerobot", "lerobot_video", "minari"])
+def test_single_row_episodes_are_kept_or_noted(minari, tmp_path, capsys, name):
+    if name.startswith("lerobot"):
+        pytest.importorskip("pyarrow")
+        pytest.importorskip("av")
+    source = own = write_fake_set(tmp_path / "own", [1, 5, 1, 6], attributes={"task": "walker_walk"})
+    if name != "vd4rl":
+        export_set(name, own, source := tmp_path / "a-v0")
+    noted = "episodes of a single row are left out" in capsys.readouterr().err
+    import_set(name, str(source), tmp_path / "back")
+    back, lengths = rows_of_set(tmp_path / "back"), [5, 6] if name == "minari" else [1, 5, 1, 6]
+    assert np.diff(np.flatnonzero(back["step_type"] == StepType.FIRST), append=sum(lengths)).tolist() == lengths
+    assert noted == (name == "minari")
+    if not noted:
+        assert_equal_rows(rows_of_set(own), back, but=["observation"] if name == "lerobot_video" else [])
 
 
 def write_ogbench(path, episodes):
@@ -320,7 +338,6 @@ EPISODE = np.zeros((4, 64, 64, 3), np.uint8), np.zeros((4, 2), np.float32)
     [
         ([EPISODE] * 2, {"actions": np.zeros((4, 2))}, "has 8 images, 4 actions and 8 terminals"),
         ([EPISODE] * 2, {"terminals": np.zeros(4)}, "has 8 images, 8 actions and 4 terminals"),
-        ([tuple(part[:1] for part in EPISODE)], {}, "episode 0: has no step"),
         ([(np.zeros((3, 28), np.float32), np.zeros((3, 5), np.float32))], {}, "holds no images"),
         ([EPISODE], None, "cannot be read as this format"),
     ],
@@ -354,7 +371,9 @@ def test_minari_arrays_of_unequal_length_are_rejected(minari, key, tmp_path):
 def test_npz_round_trip_loses_only_physics(tmp_path, capsys):
     folder = write_fake_set(tmp_path / "walker_walk" / "expert", LENGTHS, complete_last=False, physics_dim=18)
     main(["data", "export", "vd4rl_npz", str(folder), str(tmp_path / "npz")])
-    assert "simulator states" in capsys.readouterr().err
+    stderr = capsys.readouterr().err
+    assert "simulator states" in stderr
+    assert "task and quality are not stored: import with --task walker_walk and --quality expert" in stderr
     names = sorted(os.listdir(tmp_path / "npz"))
     assert [name.rpartition("-")[2] for name in names] == [f"{length}.npz" for length in LENGTHS]
     with np.load(tmp_path / "npz" / names[0]) as first:
@@ -362,6 +381,66 @@ def test_npz_round_trip_loses_only_physics(tmp_path, capsys):
         assert [first[key].nonzero()[0].tolist() for key in ("is_first", "is_last", "is_terminal")] == [[0], [19], []]
     main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "cheetah_run")])
     assert_equal_rows(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
+
+
+def rewrite_npz(folder, change):
+    """Export a set of two episodes as .npz files, with `change` made to each one's arrays, and return both sets."""
+    own, npz = (folder / name / "walker_walk" / "expert" for name in ("own", "npz"))
+    export_set("vd4rl_npz", write_fake_set(own, [5, 6]), npz)
+    for file in npz.iterdir():
+        with np.load(file) as stored:
+            arrays = dict(stored)
+        np.savez(file, **(arrays | change(arrays)))
+    return own, npz
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: {"image": one["image"] / np.float32(255)}, "episode 0: has float32 images, expected uint8"),
+        (lambda one: {"image": np.repeat(one["image"][..., :1], 4, -1)}, "holds no images: expected uint8"),
+        (lambda one: {"is_first": np.arange(len(one["reward"])) % 3 == 0}, "'is_first' is true in the middle"),
+        (lambda one: {"is_last": np.arange(len(one["reward"])) % 3 == 2}, "'is_last' is true in the middle"),
+    ],
+)
+def test_npz_of_other_layouts_is_rejected(tmp_path, change, message):
+    _, npz = rewrite_npz(tmp_path, change)
+    with pytest.raises(UserError, match=message):
+        import_set("vd4rl_npz", str(npz), tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda one: {"discount": one["discount"].astype(np.int64)},
+        lambda one: {"discount": one["discount"].astype(bool)},
+        lambda one: {"action": one["action"][:, 0]},
+    ],
+)
+def test_npz_of_other_dtypes_and_shapes_is_read(tmp_path, capsys, change):
+    own, npz = rewrite_npz(tmp_path, change)
+    assert "not stored" not in capsys.readouterr().err, "the folder's name states the task"
+    import_set("vd4rl_npz", str(npz), tmp_path / "set")
+    rows, given = rows_of_set(tmp_path / "set"), rows_of_set(own)
+    given["action"] = given["action"][:, : rows["action"].shape[1]]
+    assert_equal_rows(given, rows)
+
+
+@pytest.mark.parametrize(
+    ("stack", "grey"),
+    [
+        (lambda frames: np.stack([0 * frames, 0 * frames, 0 * frames, frames], 1), False),
+        (lambda frames: np.stack([0 * frames, frames], 1).transpose(0, 1, 3, 4, 2), False),
+        (lambda frames: np.concatenate([0 * frames, frames[:, 2:]], 1), True),
+        (lambda frames: np.stack([0 * frames, frames], 1)[:, :, 2:].transpose(0, 1, 3, 4, 2), True),
+    ],
+)
+def test_newest_frame_of_a_stack_is_kept(tmp_path, stack, grey):
+    own, npz = rewrite_npz(tmp_path, lambda one: {"image": stack(one["image"].transpose(0, 3, 1, 2))})
+    import_set("vd4rl_npz", str(npz), tmp_path / "set")
+    newest = rows_of_set(own)["observation"]
+    newest = np.repeat(newest[:, 2:], 3, 1) if grey else newest
+    np.testing.assert_array_equal(rows_of_set(tmp_path / "set")["observation"], newest)
 
 
 def test_published_64_pixel_sets_print_a_note(tmp_path, capsys):
@@ -392,10 +471,16 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     assert_equal_rows(rows_of_set(tmp_path / "own"), small, but=["observation"])
 
 
-def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch):
+@pytest.mark.parametrize("shortest", [1, 8])
+def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch, shortest):
     folder = write_fake_set(tmp_path / "own", [7, 9, 8, 12, 5], attributes={"task": "walker_walk"})
     monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 20)
-    whole = import_set("vd4rl", str(folder), tmp_path / "whole")
+    whole = import_set("vd4rl", str(folder), tmp_path / "whole", shortest=shortest)
+    kept = [number for number, length in enumerate([7, 9, 8, 12, 5]) if length >= shortest]
+    assert (
+        rows_of_set(tmp_path / "whole")["observation"][:, 0, 0, 0].tolist()
+        == np.repeat(kept, [[7, 9, 8, 12, 5][number] for number in kept]).tolist()
+    )
     written = []
 
     def write(path, rows, attributes):
@@ -407,13 +492,55 @@ def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("vd4rl_pomdp.data.shards.write_shard", write)
         with pytest.raises(KeyboardInterrupt):
-            import_set("vd4rl", str(folder), tmp_path / "set")
+            import_set("vd4rl", str(folder), tmp_path / "set", shortest=shortest)
     with pytest.raises(UserError, match="collection is not finished"):
         open_dataset(tmp_path / "set")
     changed = written[0].stat().st_mtime_ns
-    shards = import_set("vd4rl", str(folder), tmp_path / "set")
+    shards = import_set("vd4rl", str(folder), tmp_path / "set", shortest=shortest)
     assert written[0].stat().st_mtime_ns == changed
     assert [shard.read_bytes() for shard in shards] == [shard.read_bytes() for shard in whole]
+
+
+def test_shards_of_large_frames_have_fewer_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 24)
+    episodes = [fake_episode(number, 6) for number in range(4)]
+    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
+    for size, shards in ((84, 1), (240, 4)):
+        rows["observation"] = np.zeros((24, 3, size, size), np.uint8)
+        own = write_rows(tmp_path / str(size), rows, {"task": "walker_walk"})
+        assert len(import_set("vd4rl", str(own), tmp_path / f"set{size}")) == shards
+
+
+def test_import_holds_two_shards_at_most(tmp_path, monkeypatch):
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 200)
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer.write_card", lambda out: None)  # it imports matplotlib
+    episodes = [fake_episode(number % 8, 20) for number in range(40)]
+    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
+    export_set("vd4rl_npz", write_rows(tmp_path / "own", rows), tmp_path / "npz")
+    del rows, episodes
+    tracemalloc.start()
+    try:
+        assert len(import_set("vd4rl_npz", str(tmp_path / "npz"), tmp_path / "set")) == 4
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2.5 * 200 * 3 * 84**2
+
+
+def test_short_episodes_are_left_out(tmp_path, own_cache, capsys):
+    own = write_fake_set(tmp_path / "own", [20, 5, 25, 1], attributes={"task": "walker_walk"})
+    with pytest.raises(UserError, match=r"holds no episodes of 26 or more rows"):
+        import_set("vd4rl", str(own), tmp_path / "none", shortest=26)
+    main(["data", "import", "vd4rl", str(own), str(tmp_path / "set"), "--shortest", "8"])
+    stderr = capsys.readouterr().err
+    assert "2 episodes of fewer than 8 rows are left out" in stderr
+    assert "2 episodes are shorter than pretraining's default window of 32 rows" in stderr
+    assert "pretrain with --window 20" in stderr
+    rows = rows_of_set(own)
+    assert_equal_rows(
+        {key: np.concatenate([v[:20], v[25:50]]) for key, v in rows.items()}, rows_of_set(tmp_path / "set")
+    )
+    assert pretrain(smoke_pretrain(tmp_path / "set", tmp_path / "run")).finished
 
 
 def test_interrupted_export_leaves_nothing(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import io
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -55,12 +56,14 @@ def deepen(table):
     return table.set_column(table.schema.get_field_index(PICTURE), PICTURE, images)
 
 
-def as_others_write(folder, scale=1.0):
-    """Make it a set of another writer: one row per action, actions scaled, no discounts and no final image."""
+def as_others_write(folder, scale=1.0, discount=False):
+    """Make it a set of another writer: one row per action, actions scaled, no final image, and no discounts or own
+    ones."""
 
     def without_last(table):
         numbers = table["episode_index"].to_numpy()
-        table = table.filter(arrow.array(np.diff(numbers, append=-1) == 0)).drop(["next.discount"])
+        table = table.filter(arrow.array(np.diff(numbers, append=-1) == 0))
+        table = table if discount else table.drop(["next.discount"])
         done = np.diff(table["episode_index"].to_numpy(), append=-1) != 0
         action = arrow.array(list(np.array(table["action"].to_pylist(), np.float32) * np.float32(scale)))
         table = table.set_column(table.schema.get_field_index("action"), "action", action)
@@ -69,7 +72,8 @@ def as_others_write(folder, scale=1.0):
     rewrite(folder, without_last)
     shorter = arrow.array([length - 1 for length in LENGTHS])
     rewrite(folder, lambda t: t.set_column(t.schema.get_field_index("length"), "length", shorter), INDEX)
-    edit_info(folder, lambda info: info["features"].pop("next.discount"))
+    column = "info" if discount else "next.discount"
+    edit_info(folder, lambda i: (i["features"]["next.discount"] if discount else i["features"]).pop(column))
     edit_info(folder, lambda info: info.update(total_frames=sum(LENGTHS) - 3))
 
 
@@ -79,7 +83,8 @@ def test_lerobot_image_round_trip_is_lossless(tmp_path, capsys):
     main(["data", "export", "lerobot", str(own), str(tmp_path / "out")])
     assert "20 a second" in capsys.readouterr().err
     main(["data", "import", "lerobot", str(tmp_path / "out"), str(tmp_path / "back")])
-    assert capsys.readouterr().err.count("note:") == 0
+    assert "pretraining's default window" in (stderr := capsys.readouterr().err)
+    assert stderr.count("note:") == 1
     assert_equal_rows(rows_of_set(own), rows_of_set(tmp_path / "back"))
     dataset = open_dataset(tmp_path / "back", tmp_path / "cache")
     assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
@@ -126,9 +131,10 @@ def test_lerobot_video_changes_only_images(tmp_path, capsys):
         import_set("lerobot", str(tmp_path / "out"), tmp_path / "damaged")
 
 
-def test_lerobot_set_without_final_images_drops_last_step(exported, tmp_path, capsys):
+@pytest.mark.parametrize("discount", [False, True])
+def test_lerobot_set_without_final_images_drops_last_step(exported, tmp_path, capsys, discount):
     out, own = exported
-    as_others_write(out, scale=100)
+    as_others_write(out, 100, discount)
     import_set("lerobot", str(out), tmp_path / "back")
     stderr = capsys.readouterr().err
     assert "rewards (3.048 in all) of 3 episodes have no following image" in stderr
@@ -142,6 +148,19 @@ def test_lerobot_set_without_final_images_drops_last_step(exported, tmp_path, ca
     action, theirs = rows["action"][rows["step_type"] != 0], given["action"][kept][rows["step_type"] != 0]
     slope, _ = np.polyfit(theirs[:, 0], action[:, 0], 1)
     np.testing.assert_allclose(action[:, 0] - slope * theirs[:, 0], (action - slope * theirs)[0, 0], atol=1e-4)
+
+
+def test_lerobot_set_without_task_gets_its_folders_name(tmp_path):
+    export_set("lerobot", write_fake_set(tmp_path / "own", LENGTHS), tmp_path / "pushing")
+    import_set("lerobot", str(tmp_path / "pushing"), tmp_path / "back")
+    assert open_dataset(tmp_path / "back", tmp_path / "cache").task == "pushing"
+
+
+def test_lerobot_sets_of_several_tasks_print_a_note(exported, tmp_path, capsys):
+    tasks = pd.DataFrame({"task_index": range(4)}, index=pd.Index(["push", "open it", "c", "d"], name="task"))
+    tasks.to_parquet(exported[0] / "meta" / "tasks.parquet")
+    import_set("lerobot", str(exported[0]), tmp_path / "back")
+    assert "its 4 tasks become one dataset: 'push', 'open it', 'c', ...\n" in capsys.readouterr().err
 
 
 def test_reading_from_later_episode_gives_same_rows(exported):
@@ -188,6 +207,7 @@ def info(change):
         (info(lambda info: info["features"][PICTURE].update(shape=[64, 64, 3])), "84x84 pixels, .* 64x64"),
         (info(lambda info: info.update(data_path="data/{0}")), "cannot be read as this format"),
         (info(lambda info: info["features"].pop(PICTURE)), "holds no images"),
+        (info(lambda i: i["features"].pop("action")), r"out: has no feature 'action' \(features: observation.image, "),
     ],
 )
 def test_damaged_lerobot_sets_are_rejected(exported, damage, message, tmp_path):

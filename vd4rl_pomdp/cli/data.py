@@ -78,6 +78,7 @@ def import_set(
     size: int | None = None,
     picture: str | None = None,
     clip_actions: bool = False,
+    shortest: int = 1,
 ) -> None:
     """Convert a dataset from another format; re-run the same command to resume.
 
@@ -90,8 +91,9 @@ def import_set(
         size: Height and width to resize images to, by area; default: no resizing.
         picture: Observation key of the images, if there are several.
         clip_actions: Clip actions outside the source's bounds instead of rejecting them.
+        shortest: Leave out episodes of fewer rows.
     """
-    shards = transfer.import_set(format, source, out, task, quality, size, picture, clip_actions)
+    shards = transfer.import_set(format, source, out, task, quality, size, picture, clip_actions, shortest)
     print(f"shards in {out}: {len(shards)}, described in {out / 'card.md'}")
 
 

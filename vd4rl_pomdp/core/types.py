@@ -23,6 +23,9 @@ from torch import Tensor
 
 from vd4rl_pomdp.core.errors import MOST_ROWS
 
+WINDOW = 32
+"""Rows of a training window, by default."""
+
 
 class StepType(IntEnum):
     """dm_env's step types, as stored in V-D4RL's `step_type`."""

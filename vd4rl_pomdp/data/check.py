@@ -80,6 +80,8 @@ def _replayed(dataset: Dataset) -> tuple[float | None, str]:
         return None, "impossible: the set stores no simulator states"
     replay: Callable[[np.ndarray, np.ndarray], np.ndarray]
     if (maze := attributes.get("task")) in MAZES:
+        if "action_repeat" not in attributes:  # imported or written by others
+            return None, "impossible: its shards do not state the action repeat"
         from vd4rl_pomdp.envs.maze import replay_states
 
         stored, replay = physics, partial(replay_states, maze, action_repeat=attributes["action_repeat"])

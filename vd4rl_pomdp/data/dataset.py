@@ -241,8 +241,8 @@ class Dataset:
             episode = int(short[0])
             raise UserError(
                 f"{self.path}: episode {episode} has {rows[episode]} rows, fewer than the window of {length} "
-                f"({len(short)} such episodes); choose a window of at most {rows[short].min()}, or remove "
-                "them from the dataset"
+                f"({len(short)} such episodes); choose a window of at most {rows[short].min()}, or leave "
+                f"them out: `vd4rl-pomdp data import vd4rl {self.path} NEW --shortest {length}`"
             )
 
     @property

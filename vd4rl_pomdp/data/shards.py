@@ -81,7 +81,9 @@ def collect_set(
                     speed = frames / (time.monotonic() - started)
                     progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
                 rows = {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
+                del rollouts, rollout  # else they stay in memory beside `rows`, and `rows` beside the next shard's
                 write_shard(shard.path, rows, shard.attributes)
+                del rows
         spent = {"seconds": round(time.monotonic() - started, 1), "frames": frames} if missing else {}  # of this call
         origin = {"command": command(), "git_commit": git_commit(), "versions": versions(), "render": rendered}
         write_json(out / PROVENANCE, spent | {"workers": count_workers(workers)} | origin)

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_number, system_error
-from vd4rl_pomdp.core.tasks import FRAME_SIZES, TASKS, DMCTask
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, TASKS, DMCTask
+from vd4rl_pomdp.core.types import WINDOW
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import PLAN, PROVENANCE
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
@@ -30,7 +31,7 @@ from vd4rl_pomdp.runs.outputs import built, refuse_inside, removing_if_empty
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 _SHARD_ROWS = 5_000
-"""Approximate number of rows per shard, which is also how many are in memory at once."""
+"""Approximate number of rows per shard, fewer if frames exceed 84 pixels; twice as many are in memory at once."""
 _ROUNDING = 1e-5
 """Tolerance for actions beyond their bounds, for float32 rounding."""
 
@@ -44,6 +45,7 @@ def import_set(
     size: int | None = None,
     picture: str | None = None,
     clip_actions: bool = False,
+    shortest: int = 1,
 ) -> list[Path]:
     """Convert a data set of another format to this package's, or only its missing shards; returns its shards.
 
@@ -54,36 +56,40 @@ def import_set(
         size: height and width to resize images to, by area averaging; None: no resizing.
         picture: name of the observation that holds the images, if there are several.
         clip_actions: whether actions outside the source's bounds are clipped; otherwise they are refused.
+        shortest: episodes of fewer rows are left out.
     """
     refuse_inside(out)
+    refuse_number("shortest", shortest, 1)
     with _errors_of(source):
         stored = FORMATS.named(name).read(source, picture)
         opened = _resized(stored, size)
-        if not opened.episodes:
-            raise UserError("holds no episodes")
+        numbers = [number for number, rows in enumerate(opened.lengths) if rows >= shortest]
+        if not numbers:
+            raise UserError(f"holds no episodes of {shortest} or more rows" if opened.lengths else "holds no episodes")
+    lengths = [opened.lengths[number] for number in numbers]
     own = next((value for value in opened.record.values() if isinstance(value, str)), name)
     # without a known task, its label (also used in file names) is made from the source's own name
     label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
-    _print(opened.notes)
+    _print([*opened.notes, *_about_lengths(lengths, len(opened.lengths) - len(lengths), shortest)])
     if opened.frame_shape != stored.frame_shape and isinstance(TASKS.get(label), DMCTask):
         means = f"evaluations render {label} at {size}x{size}, which gives other pixels than these means"
         _print([f"{means}: `vd4rl-pomdp data parity {out}` compares them"])
     settings: dict[str, Any] = {
         "format": name,
         "source": opened.record,
-        "episodes": opened.episodes,
+        "episodes": len(numbers),
         "task": label,
         "set": quality or opened.quality,
         "frame_size": opened.frame_shape[0],
     }
-    per_shard = max(1, _SHARD_ROWS * opened.episodes // max(1, opened.rows))
+    rows = _SHARD_ROWS * FRAME_SIZE**2 // max(FRAME_SIZE, opened.frame_shape[0]) ** 2
+    per_shard = max(1, rows * len(numbers) // sum(lengths))
     attributes = {key: settings[key] for key in ("task", "set") if settings[key]} | {
         "imported": {"format": name, **opened.record}
     }
-    numbers = list(range(opened.episodes))
     shards = [
         Shard(out / f"{start // per_shard}_{label}.hdf5", numbers[start : start + per_shard], attributes)
-        for start in range(0, opened.episodes, per_shard)
+        for start in range(0, len(numbers), per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
     with removing_if_empty(out):
@@ -106,7 +112,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
         writable = [other for other, one in FORMATS.items() if one.write]
         raise UserError(f"the format {name!r} cannot be written: choose one of {', '.join(writable)}")
     opened = _resized(read_shards(str(path)), size)
-    progress = ProgressLine("export", opened.episodes, "episodes")
+    progress = ProgressLine("export", len(opened.lengths), "episodes")
 
     def read(first: int) -> Iterator[EpisodeArrays]:
         for rows in opened.read(first):
@@ -131,53 +137,65 @@ def _errors_of(place: str) -> Iterator[None]:
         ) from error
 
 
+def _about_lengths(lengths: list[int], dropped: int, shortest: int) -> Iterator[str]:
+    if dropped:
+        yield f"{dropped} episodes of fewer than {shortest} rows are left out"
+    short = [rows for rows in lengths if 1 < rows < WINDOW]  # single rows are in no window
+    if short:
+        yield (
+            f"{len(short)} episodes are shorter than pretraining's default window of {WINDOW} rows: pretrain "
+            f"with --window {min(short)}, or leave them out with --shortest {WINDOW}"
+        )
+
+
 class _Reader:
-    """Returns an episode's rows by number; a number that does not follow the last one (after a shard that exists)
-    starts a new pass over the source."""
+    """Returns an episode's rows by number, in increasing order."""
 
     def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
         self._name, self._source, self._clip = name, source, clip
         self._next = -1
-        self._episodes: Iterator[EpisodeArrays] = iter(())
+        self._episodes: Iterator[tuple[int, EpisodeArrays]] | None = None
         self._layout: dict[str, tuple[int, ...]] = {}
         self._last = np.zeros(0, np.uint8)  # last image of the previous episode
-        self._clipped = self._read = self._still = self._joined = 0
+        self._clipped = self._steps = self._followed = self._joined = 0
+        self._moved = False
         self.called = False
         """Whether this process imports, not another one that owns the folder."""
 
     def __call__(self, number: int) -> EpisodeArrays:
         self.called = True
         with _errors_of(f"{self._name}: episode {number}"):
-            if number != self._next:
-                self._episodes = self._source.read(number)
-            rows = next(self._episodes, None)
+            if self._episodes is None:
+                self._episodes = enumerate(self._source.read(number), number)
+            rows = next((rows for found, rows in self._episodes if found == number), None)
             if rows is None:
                 raise UserError("is missing")
             frames, size = rows[FRAMES_KEY], self._source.frame_shape
-            if len(frames) < 2:
-                raise UserError("has no step: remove it from the source")
             rows = rows | {"action": self._scaled(rows["action"])}
             if frames.shape[2:] != size:
                 found, declared = (f"{height}x{width}" for height, width in (frames.shape[2:], size))
                 raise UserError(f"has images of {found} pixels, its dataset declares {declared}")
             layout = {key: values.shape[1:] for key, values in rows.items()}
-            if frames.dtype != np.uint8 or layout != (self._layout or layout):
-                raise UserError(f"has {frames.dtype} images and rows of {layout}, unlike the episodes before")
+            if frames.dtype != np.uint8:
+                raise UserError(f"has {frames.dtype} images, expected uint8")
+            if layout != (self._layout or layout):
+                raise UserError(f"has rows of {layout}, unlike the episodes before")
             self._layout = layout
             states = {key: values for key, values in rows.items() if key != FRAMES_KEY}
             check_rows(f"{self._name}: episode {number}", states, len(frames))
-            self._read += 1
-            self._still += np.array_equal(frames[1], frames[0]) and bool((frames[1:] == frames[0]).all())
+            self._steps += len(frames) - 1
+            self._moved = self._moved or bool((frames[1:] != frames[0]).any())
+            self._followed += number == self._next
             self._joined += number == self._next and np.array_equal(frames[0], self._last)
-            self._next, self._last = number + 1, frames[-1]
+            self._next, self._last = number + 1, frames[-1].copy()
             return rows
 
     def notes(self) -> Iterator[str]:
         if self._clipped:
             yield f"{self._clipped} actions lay outside their bounds and were clipped"
-        if self._still and self._still == self._read:
+        if self._steps and not self._moved:
             yield "in every episode all images are equal: did the recorder keep references to one buffer?"
-        elif self._joined and self._joined == self._read - 1:
+        elif self._joined and self._joined == self._followed:
             yield "every episode begins with the last image of the one before: its first step crosses a reset"
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:

@@ -19,9 +19,8 @@ from vd4rl_pomdp.data.shards import EpisodeArrays
 class SourceSet:
     """An opened data set whose episodes are read one at a time."""
 
-    episodes: int
-    rows: int
-    """Total number of rows, which may be approximate; it determines how many episodes go into a shard."""
+    lengths: list[int]
+    """Rows of every episode."""
     frame_shape: tuple[int, int]
     """Height and width of the pictures."""
     read: Callable[[int], Iterator[EpisodeArrays]]
@@ -97,28 +96,36 @@ def one_hot(action: np.ndarray, number: int) -> np.ndarray:
 
 _CHANNELS = (1, 3, 6, 9, 12)
 """Valid channel counts: grey, or RGB times up to 4 stacked frames."""
+_GREY_STACK = 4
+"""Also valid before height and width: Atari's four grey frames. Behind them it could be RGB with transparency."""
 
 
 def picture_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
-    """Height and width of a picture (H, W), (H, W, C) or (C, H, W), None for other shapes."""
+    """Height and width of a picture (H, W), (H, W, C) or (C, H, W), or of a stack (S, H, W, C) or (S, C, H, W) of them;
+    None for other shapes."""
+    shape = shape[1:] if len(shape) == 4 else shape
     if len(shape) == 2 or (len(shape) == 3 and shape[2] in _CHANNELS):
         return shape[0], shape[1]
-    return (shape[1], shape[2]) if len(shape) == 3 and shape[0] in _CHANNELS else None
+    return (shape[1], shape[2]) if len(shape) == 3 and shape[0] in (*_CHANNELS, _GREY_STACK) else None
 
 
 def as_frames(pictures: np.ndarray) -> np.ndarray:
     """Convert (T, ...) uint8 images, of shapes that `picture_size` accepts, to (T, 3, H, W); newest frame of stacks."""
-    if pictures.ndim == 3:
+    if pictures.ndim == 5:
+        pictures = pictures[:, -1]
+    elif pictures.ndim == 3:
         pictures = pictures[..., None]
     frames = np.moveaxis(pictures, -1, 1) if pictures.shape[-1] in _CHANNELS else pictures
-    return np.repeat(frames, 3, axis=1) if frames.shape[1] == 1 else frames[:, -3:]
+    return np.repeat(frames[:, -1:], 3, axis=1) if frames.shape[1] in (1, _GREY_STACK) else frames[:, -3:]
 
 
 def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[str, tuple[int, int]]:
     """Name and image size of one of the uint8 observations with `shapes`: of `picture`, else of the only candidate."""
     known = {name: size for name, shape in shapes.items() if (size := picture_size(shape))}
     if not known:
-        raise UserError("holds no images: expected uint8 observations of shape (H, W), (H, W, 3) or (3, H, W)")
+        raise UserError(
+            "holds no images: expected uint8 observations of shape (H, W), (H, W, 3) or (3, H, W), or stacks of them"
+        )
     if picture in known or (picture is None and len(known) == 1):
         return next((name, size) for name, size in known.items() if picture in (name, None))
     raise UserError(f"has several image observations: choose one with --picture, of {', '.join(known)}")

@@ -6,7 +6,7 @@
 
 A row holds an image and an action, so an episode's final observation needs an extra row. Most data sets lack it, and
 their last actions and rewards cannot be used. Data sets written here have it, with the last action repeated, as in
-LeRobot's own evaluation; their column `next.discount` identifies them.
+LeRobot's own evaluation; what info.json says of their column `next.discount` identifies them.
 """
 
 from __future__ import annotations
@@ -50,9 +50,12 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
     folder, pq = Path(path), _parquet()
     info = _info(folder)
     features, episodes = info["features"], _episodes(pq, folder, info)
+    if "action" not in features:
+        raise UserError(f"has no feature 'action' (features: {', '.join(features)})")
     cameras = {name: tuple(one["shape"]) for name, one in features.items() if one["dtype"] in ("image", "video")}
     key, shape = chosen(cameras, picture)
-    own, lengths = _OWN in features, episodes["length"]
+    marked = features.get(_OWN, {}).get("info") or {}
+    own, lengths = "quality" in marked, episodes["length"]
 
     def files(kind: str, template: str) -> list[Path]:
         numbers = zip(episodes[f"{kind}/chunk_index"], episodes[f"{kind}/file_index"], strict=True)
@@ -60,11 +63,16 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
     data, filmed = files("data", info["data_path"]), features[key]["dtype"] == "video"
     films = files(f"videos/{key}", info["video_path"]) if filmed else []
-    outcomes = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
+    kept = ("next.reward", "next.done", "next.truncated", *((_OWN, "physics") if own else ()))
+    outcomes = [name for name in kept if name in features]
     low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), outcomes)
     tasks = [str(one) for one in pq.read_table(folder / "meta" / "tasks.parquet").to_pandas().index]
     named = tasks[0] if len(tasks) == 1 and re.fullmatch(r"[\w.-]+", tasks[0]) else None
-    notes += [f"its task is {one!r}" for one in tasks if len(tasks) == 1 and not named]
+    if own and named == _NO_TASK:
+        named = None
+    elif tasks and not named:
+        several = f"its {len(tasks)} tasks become one dataset: " if len(tasks) > 1 else "its task is "
+        notes.append(several + ", ".join([repr(one) for one in tasks[:3]] + ["..."] * (len(tasks) > 3)))
 
     def read(first: int) -> Iterator[EpisodeArrays]:
         columns = ["episode_index", "timestamp", "action", *outcomes, *([] if filmed else [key])]
@@ -81,8 +89,7 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
     size = sum(file.stat().st_size for file in {*data, *films})
     record = {"set": folder.resolve().name, "picture": key, "bytes": size}
-    quality = (features[_OWN].get("info") or {}).get("quality") if own else None
-    return SourceSet(len(lengths), sum(lengths), shape, read, record, low, high, named, quality, notes)
+    return SourceSet(lengths, shape, read, record, low, high, named, marked.get("quality"), notes)
 
 
 def _info(folder: Path) -> dict[str, Any]:
@@ -209,7 +216,7 @@ def _rows(stored: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> Episo
 
 def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = False) -> list[str]:
     """Write a data set for `LeRobotDataset(NAME, root=FOLDER)`, with images as PNG in the rows or as H.264 videos."""
-    size, end, files = source.frame_shape[0], 0, 0
+    size, end, files, total = source.frame_shape[0], 0, 0, sum(source.lengths)
     if video and size % 2:
         raise UserError(f"video needs an even height and width, not {size}: pass --size, or use the format `lerobot`")
     held, index, changes = list[Any](), list[dict[str, Any]](), list[tuple[float, int]]()
@@ -235,7 +242,7 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
         for name, values in (columns | {_PICTURE: rows[FRAMES_KEY][::10]}).items():
             place |= {f"stats/{name}/{kind}": value for kind, value in _stats(values).items()}
         index.append(place)
-        if end == source.rows or sum(table.nbytes for table in held) >= _FILE_MB * 2**20:
+        if end == total or sum(table.nbytes for table in held) >= _FILE_MB * 2**20:
             _save(folder / _DATA.format(**_numbered("", files)), held)
             held, files = [], files + 1
     _save(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", [_arrow().Table.from_pylist(index)])

@@ -73,8 +73,7 @@ def read(source: str, picture: str | None) -> SourceSet:
 
     bounded = not discrete and actions.is_bounded()
     return SourceSet(
-        len(lengths),
-        sum(lengths) + len(lengths),
+        [steps + 1 for steps in lengths],
         size,
         lambda first: map(episode, range(first, len(lengths))),
         {"id": dataset.id, "picture": key, "steps": sum(lengths), "minari": dataset.minari_version},
@@ -112,7 +111,10 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     name = out.resolve().relative_to(home).as_posix() if out.resolve().is_relative_to(home) else out.name
     matched = library("minari.dataset.minari_dataset", "minari").DATASET_ID_RE.fullmatch(name)
     if not matched or not matched["version"]:
-        raise UserError(f"{out}: Minari's names end in a version: call the folder {out.name or 'walker'}-v0")
+        raise UserError(
+            f"{out}: Minari does not accept the name {name!r}: end it in a version, as in walker-v0 or mine/walker-v0, "
+            "with only letters, digits, - and _, and at least two characters before a /"
+        )
     folder.mkdir()
     # Dimensions come from the first episode. Minari does not treat (3, S, S) as an image, so it is never JPEG-encoded.
     first = next(source.read(0))

@@ -50,8 +50,7 @@ def read(source: str, picture: str | None) -> SourceSet:
                     yield rows_of(as_frames(frames), action[start : end - 1], np.zeros(steps), False)
 
     return SourceSet(
-        len(ends),
-        len(terminals),
+        (ends - starts).tolist(),
         size,
         episodes,
         {"file": path.name.removesuffix(".npz"), "bytes": path.stat().st_size},

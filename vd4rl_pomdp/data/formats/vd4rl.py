@@ -6,9 +6,9 @@ An episode's file holds `image` (T + 1, S, S, 3) uint8, `action`, `reward`, `dis
 
 from __future__ import annotations
 
-import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,7 @@ def read_shards(path: str, picture: str | None = None) -> SourceSet:
 
     task, quality = task_and_quality(folder, stored.attributes)
     record = {"set": folder.resolve().name, "bytes": sum(shard.stat().st_size for shard in stored.shards)}
-    return SourceSet(len(ends), int(ends[-1]), (size, size), read, record, task=task, quality=quality)
+    return SourceSet((ends - stored.starts).tolist(), (size, size), read, record, task=task, quality=quality)
 
 
 def read_npz(path: str, picture: str | None = None) -> SourceSet:
@@ -50,10 +50,9 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise UserError(f"{folder}: holds no .npz episodes; name the folder that holds them, such as TASK/QUALITY/64px")
-    shape = _episode(files[0])[FRAMES_KEY].shape
-    _, frame_shape = chosen({"image": shape[1:]}, picture)
-    lengths = [re.search(r"-(\d+)$", file.stem) for file in files]
-    rows = sum(int(length[1]) if length else shape[0] for length in lengths)
+    with _opened(files[0]) as first:
+        _, frame_shape = chosen({"image": first["image"].shape[1:]}, picture)
+    lengths = [_length(file) for file in files]
     (task, quality), notes = task_and_quality(folder, []), []
     if "64px" in folder.resolve().parts and len(files) <= 100 and task and quality:  # V-D4RL's paper states more
         expert = " of the expert only" if quality == "medium_expert" else ""
@@ -64,29 +63,48 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
         ]
     record = {"folder": folder.resolve().name, "bytes": sum(file.stat().st_size for file in files)}
     read = lambda first: map(_episode, files[first:])  # noqa: E731
-    return SourceSet(len(files), rows, frame_shape, read, record, task=task, quality=quality, notes=notes)
+    return SourceSet(lengths, frame_shape, read, record, task=task, quality=quality, notes=notes)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+    """An episode's arrays, each read when accessed."""
+    try:
+        with np.load(path) as file:
+            if missing := [key for key in ("image", "action", "reward") if key not in file]:
+                keys = ", ".join(file)
+                raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {keys})")
+            yield file
+    except UserError:
+        raise
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); download it again") from error
+
+
+def _length(path: Path) -> int:
+    with _opened(path) as file:
+        return len(file["reward"])
 
 
 def _episode(path: Path) -> EpisodeArrays:
-    try:
-        with np.load(path) as file:
-            stored = {key: file[key] for key in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise UserError(f"{path}: is damaged or not an .npz file ({in_one_line(error)}); download it again") from error
-    if missing := [key for key in ("image", "action", "reward") if key not in stored]:
-        raise UserError(f"{path}: has no {missing[0]!r}, so it is not an episode of V-D4RL (keys: {', '.join(stored)})")
+    with _opened(path) as file:
+        stored = dict(file)
     rows = len(stored["reward"])
     for key in ("image", "action", "discount", "is_first", "is_last", "is_terminal"):
         if (count := len(stored.get(key, stored["reward"]))) != rows:
             raise UserError(f"{path}: {key!r} has {count} rows, 'reward' {rows}; download it again")
+    for key, inner in (("is_first", slice(1, None)), ("is_last", slice(0, -1))):
+        if stored.get(key, np.zeros(1))[inner].any():
+            raise UserError(f"{path}: {key!r} is true in the middle: split it into one file per episode")
     step_type = np.full(rows, StepType.MID, np.int64)
     step_type[-1:] = StepType.LAST if stored.get("is_last", np.ones(1))[-1:].any() else StepType.MID
     step_type[:1] = StepType.FIRST
+    action, ended = stored["action"], stored.get("is_terminal", np.zeros(rows))
     return {
         FRAMES_KEY: as_frames(stored["image"]),
-        "action": stored["action"],
+        "action": action[:, None] if action.ndim == 1 else action,
         "reward": stored["reward"].astype(float),
-        "discount": stored["discount"] if "discount" in stored else 1.0 - stored.get("is_terminal", np.zeros(rows)),
+        "discount": stored["discount"].astype(float) if "discount" in stored else 1.0 - ended,
         "step_type": step_type,
     }
 
@@ -108,8 +126,15 @@ def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
             is_last=step_type == StepType.LAST,
             is_terminal=rows["discount"] == 0,
         )
-    return ["simulator states are not kept"] if states else []
+    lost = ["simulator states are not kept"] if states else []
+    names = {"task": source.task, "quality": source.quality}
+    if any(name and name != found for name, found in zip(names.values(), task_and_quality(out, []), strict=True)):
+        flags = " and ".join(f"--{key} {name}" for key, name in names.items() if name)
+        lost.append(f"task and quality are not stored: import with {flags}, or name the folder TASK/QUALITY/64px")
+    return lost
 
 
-VD4RL = DataFormat("V-D4RL's HDF5 shards, this package's own format: to change the frame size", read_shards)
+VD4RL = DataFormat(
+    "V-D4RL's HDF5 shards, this package's own format: to change the frame size or drop short episodes", read_shards
+)
 VD4RL_NPZ = DataFormat("V-D4RL's 64-pixel .npz episodes, in DreamerV2's layout", read_npz, write_npz)

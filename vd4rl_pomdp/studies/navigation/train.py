@@ -73,12 +73,13 @@ class MazeData:
         names = {stored.get("task") for stored in dataset.store.meta["attributes"]}
         lengths = dataset.episode_end - dataset.episode_start
         single = f"trajectory {int(lengths.argmin())} is a single row, without a step"
+        without = f"`vd4rl-pomdp data import vd4rl {config.data} NEW --shortest 2`"
         for wrong, what in (
             (len(names) != 1 or not names <= set(MAZES), f"names no maze; {again}"),
             (dataset.frame_size != PICTURE_SIZE, f"has frames of {dataset.frame_size} pixels, mazes of 100; {again}"),
             (dataset.physics is None, f"holds no true states ('physics'), which the probe needs; {again}"),
             (len(lengths) < 2, "a single trajectory leaves none to hold out; collect more --trajectories"),
-            (lengths.min() < 2, f"{single}; remove it, or collect the dataset again"),
+            (lengths.min() < 2, f"{single}; leave it out: {without}"),
         ):
             if wrong:
                 raise UserError(f"{config.data}: {what}")
