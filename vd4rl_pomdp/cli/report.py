@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from vd4rl_pomdp.report import compare as comparing
     from vd4rl_pomdp.report import load, page
     from vd4rl_pomdp.runs import results
+    from vd4rl_pomdp.studies import certify as certifying
     from vd4rl_pomdp.sweeps import members
 else:
     evaluation = Later("finetune.evaluation")
@@ -26,6 +27,7 @@ else:
     load = Later("vd4rl_pomdp.report.load")
     page = Later("vd4rl_pomdp.report.page")
     results = Later("vd4rl_pomdp.runs.results")
+    certifying = Later("vd4rl_pomdp.studies.certify")
     members = Later("vd4rl_pomdp.sweeps.members")
 
 
@@ -101,6 +103,7 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
         replay: Folder of a run with encoder and policy; the first episode of its last evaluation is replayed.
     """
     runs, wrong = results.verify_results(folder)
+    wrong += certifying.contradictions(folder)
     print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
     if replay is not None:
         row, now, where = evaluation.replay(replay, runs)

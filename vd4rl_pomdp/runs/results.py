@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +24,7 @@ from typing import Any
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import damaged, fits, parse_json, read_bytes
-from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.critic import KEYS, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, EVALUATION_SEED, episodes_until, read_episodes
@@ -48,6 +49,8 @@ FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CON
 
 CERTIFICATES = "certificates.json"
 NOT_CERTIFIED = "not certified"
+MEASURED = ("critic", "reference", "probe", "results")
+"""FILES that hold a run's measures besides its rows."""
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
 DAMAGED = "its files are damaged", "use another copy, or leave it out"
 """Message for a run whose files do not hold what a run writes."""
@@ -152,6 +155,12 @@ class Result:
         """Whether its measures begin with another's. Later evaluations of one policy (`evaluate --keep`) only add."""
         return self.measured[: len(other.measured)] == other.measured
 
+    def agrees(self, other: Result) -> bool:
+        """Whether another copy has the same measures, as far as both have them."""
+        both = [name for name in MEASURED if name in self.files and name in other.files]
+        same = self.losses == other.losses and all(self.files[name] == other.files[name] for name in both)
+        return same and (self.extends(other) or other.extends(self))
+
     @property
     def finished(self) -> bool:
         return "timing" in self.files
@@ -224,6 +233,9 @@ def _check(run: Result) -> None:
         raise TypeError("a part of it is not a JSON object")
     if "seed" not in config or not isinstance(stage, str):
         raise TypeError(f"its record holds no settings, or its stage is {stage!r}")
+    numbers = [value for name in ("probe", "reference") for value in run.files.get(name, {}).values()]
+    if any(isinstance(value, float) and not math.isfinite(value) for value in numbers):
+        raise TypeError("its probe or reference is not finite")
     critic = run.files.get("critic", {})
     if critic.keys() - KEYS or any(not (fits(v, float | None) and math.isfinite(v or 0)) for v in critic.values()):
         raise TypeError(f"its {CRITIC_FILE} is {critic}")
@@ -284,7 +296,7 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
 
     Results folders nested in another one belong to other experiments and are read only if named themselves; the results
     folder `but` is skipped unless it is in `paths`. UserError if a path is missing, there is no run, two runs with one
-    id have different rows, or a file is damaged.
+    id have different rows or records, or a file is damaged.
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
@@ -306,7 +318,7 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     found: dict[str, Result] = {}
     for run in runs:
         other = found.setdefault(run.id, run)
-        if other.ending and other.ending == run.ending and not (run.extends(other) or other.extends(run)):
+        if other.ending and other.ending == run.ending and not run.agrees(other):
             raise UserError(
                 f"{run.path} and {other.path}: two runs with the same method, setting and seed; name one of them"
             )
@@ -314,11 +326,11 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     return list(found.values())
 
 
-def _completeness(run: Result) -> tuple[int, int, bool, int, int]:
+def _completeness(run: Result) -> tuple[int, int, bool, int, int, int]:
     """Sort key of two copies of a run: a finished, then a diverged one; of those the one that was evaluated more; then
-    a run folder, which alone is up to date while the run continues; then the one further along."""
+    a run folder, which alone is up to date while the run continues; then the one further along, or with more files."""
     played = len(run.measured)
-    return run.ending, played if run.ending else 0, run.folder, played, run.step
+    return run.ending, played if run.ending else 0, run.folder, played, run.step, len(run.files)
 
 
 def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
@@ -336,17 +348,18 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
         ended = [run for run in found if run.ending]
         fresh = {run.id: run for run in ended if run.id not in there or run.ending > there[run.id].ending}
         again = [run for run in ended if run.id not in fresh]
-        longer = {run.id: run for run in again if run.extends(there[run.id]) and not there[run.id].extends(run)}
+        same = [run for run in again if run.agrees(there[run.id])]
+        # rows only: a copy's other records, such as its commit, do not replace those there
+        longer = {run.id: replace(there[run.id], rows=run.rows) for run in same if not there[run.id].extends(run)}
         if fresh or longer:
             write_results(out, (there | fresh | longer).values())
         keep_certificates(out, certificates_of(found, map(Path, paths)))
-    known = sum(there[run.id].extends(run) for run in again)
     counts = {
         f"run{'s' * (len(fresh) != 1)} added": len(fresh) or "0",
-        "there already": known,
+        "there already": len(same) - len(longer),
         "there already, with later evaluations added": len(longer),
-        "there already with other rows, which stay (remove their lines to replace them)": (
-            len(again) - known - len(longer)
+        "there already with other rows or records, which stay (remove their lines to replace them)": (
+            len(again) - len(same)
         ),
         "unfinished and left out": len(found) - len(ended),
     }
@@ -408,10 +421,23 @@ def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
     """The runs of a results folder, and a sentence for each contradiction with their own records.
 
     Ids must match the recorded settings, seed, data and format. Episodes must be exactly those that the settings ask
-    for, with the run's labels; environment seeds must match episode numbers, and scores their returns.
+    for, with the run's labels; environment seeds must match episode numbers, and scores their returns. Seeds must
+    differ in some return.
     """
     runs = read_results(folder)
-    return runs, [f"run {run.id}: {problem}" for run in runs for problem in _contradictions(run)]
+    wrong = [f"run {run.id}: {problem}" for run in runs for problem in _contradictions(run)]
+    stored = Counter(row["id"] for row in read_episodes(Path(folder) / EPISODES_FILE))
+    for name, count in (stored - Counter({run.id: len(run.rows) for run in runs})).items():
+        wrong.append(f"run {name}: {count} rows more than {RUNS} says")
+    seen: dict[tuple[Any, ...], Result] = {}
+    for run in runs:
+        returns = tuple(row["return"] for row in run.rows)
+        if len(set(returns)) > 1:  # else the task may be one whose reward is rare
+            alike = tuple(value for name, value in run.labels.items() if name != "seed")
+            other = seen.setdefault((run.experiment, alike, returns), run)
+            if other.labels["seed"] != run.labels["seed"]:
+                wrong.append(f"run {run.id}: all its returns are those of run {other.id}, another seed")
+    return runs, wrong
 
 
 def _contradictions(run: Result) -> Iterator[str]:
@@ -430,7 +456,19 @@ def _contradictions(run: Result) -> Iterator[str]:
         for name in sorted(trained.keys() & card.get("settings", {}).keys() - {"steps", "corruption"}):
             if trained[name] != card["settings"][name]:
                 yield f"its encoder says {name} {trained[name]}, its settings {card['settings'][name]}"
-        data, mean = run.files.get("critic", {}).get("data"), run.files.get("reference", {}).get("mean_reward")
+        reference, task = run.files.get("reference", {}), _shipped(run)
+        data, mean = run.files.get("critic", {}).get("data"), reference.get("mean_reward")
+        plan = run.record.get("collection") or {}
+        if {"task", "quality"} <= plan.keys():
+            noise = f"_noise{plan['action_noise']:g}" if plan.get("action_noise") else ""
+            for name, made in (("task", plan["task"]), ("quality", plan["quality"] + noise)):
+                if run.labels[name] != made:
+                    yield f"its labels have the {name} {run.labels[name]}, its data were collected as {made}"
+            # a set of shorter episodes is one for tests, whose evaluations are shorter, too
+            total, n = reference.get("data_return"), task.decisions if task else 0
+            whole = n > 0 and config.get("eval_length", n) >= n and None not in (mean, total)
+            if whole and abs(total - mean * n) > n * 2e-6:
+                yield f"its data return {total}, but {n} times the mean reward {mean} is {n * mean:.4f}"
         gamma = config.get("gamma", 1)
         if None not in (data, mean) and gamma < 1 and abs(data - mean / (1 - gamma)) > _ROUNDING:
             yield f"its critic.json has data value {data}, but mean reward {mean} gives {mean / (1 - gamma):.4f}"
@@ -460,15 +498,20 @@ def _astray(run: Result) -> Iterator[str]:
         numbers = played.get((step, under), [])
         if numbers != list(range(count)):
             yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
-    task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})
+    task, reference, shipped = TASKS.get(run.labels["task"]), run.files.get("reference", {}), _shipped(run)
     longest = min(config.get("eval_length", math.inf), task.decisions if task else math.inf)
+    shortest, right = (longest, longest) if shipped else (1, f"within 1 and {longest}")
+    most = shipped.action_repeat if shipped else math.inf
     divisor = task.score_divisor if task else math.nan
     known = reference.get("actor") is not None if "mean_reward" in reference else None  # earlier runs do not record it
     wrong = {
         "environment seeds are not those of their numbers": [
             row["episode_seed"] != row["episode"] + EVALUATION_SEED for row in run.rows
         ],
-        f"lengths are not within 1 and {longest}": [not 1 <= row["length"] <= longest for row in run.rows],
+        f"lengths are not {right}": [not shortest <= row["length"] <= longest for row in run.rows],
+        f"returns are not within 0 and {most} per decision": [
+            bool(shipped) and not 0 <= row["return"] <= most * row["length"] for row in run.rows
+        ],
         f"scores are not their returns / {divisor:g}": [
             abs(row["score"] - row["return"] / divisor) > _ROUNDING for row in run.rows
         ],
@@ -477,6 +520,13 @@ def _astray(run: Result) -> Iterator[str]:
         ],
     }
     yield from (f"{sum(found)} {what}" for what, found in wrong.items() if any(found))
+
+
+def _shipped(run: Result) -> DMCTask | None:
+    """The run's task if this package ships it: such tasks never end early, and their rewards are within 0 and 1."""
+    name = run.labels["task"]
+    task = TASKS.get(name)
+    return task if isinstance(task, DMCTask) and not TASKS.origin(name) else None
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
@@ -488,5 +538,6 @@ def refuse_loss(runs: Sequence[Result], out: Path) -> None:
         raise UserError(f"{out}: holds the results of {len(lost)} runs that would be lost; {what}")
     for run in there:
         other = written[run.id]
-        if not other.extends(run) and other.ending <= run.ending:
-            raise UserError(f"{out}: holds other rows of run {run.id}, which would be lost; choose another --out")
+        if other.ending <= run.ending and not (other.extends(run) and other.agrees(run)):
+            what = f"other rows or records of run {run.id}"
+            raise UserError(f"{out}: holds {what}, which would be lost; choose another --out")

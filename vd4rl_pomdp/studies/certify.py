@@ -29,6 +29,7 @@ from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.hardware import pick_device
 from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.reading import damaged
 from vd4rl_pomdp.core.tasks import UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
@@ -40,7 +41,7 @@ from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_in
 from vd4rl_pomdp.runs.files import Row, groups, read_json, write_json
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.provenance import git_commit
-from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
+from vd4rl_pomdp.runs.results import CERTIFICATES, certificate_id, keep_certificates
 from vd4rl_pomdp.sweeps.grid import GridCell, load_grid
 from vd4rl_pomdp.sweeps.plan import Job, training_job
 from vd4rl_pomdp.sweeps.stages import check_cells, recorded
@@ -106,19 +107,12 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     record = read_record(runs[MEMORY][0] / "pretrain" / "encoder")
     hidden, usual = record.pretrain.corruption, flat(CorruptionConfig.of(record.pretrain.corruption["corruption"]))
     options = (f"{name} {value}" for name, value in hidden.items() if usual.get(name) != value)
-    verdicts = {row["verdict"] for row in measured.values()}
     budget = {"steps": record.pretrain.steps, "updates": measured.get("returns", {}).get("updates", 0)}
     certificate = {
         "data": dataset.fingerprint,
         **{"task": dataset.task, "quality": dataset.quality, "corruption": hidden},
         "name": ", ".join([hidden["corruption"], *options]),
-        "verdict": verdicts.pop() if len(verdicts) == 1 else OPEN,
-        "why": "; ".join(
-            [
-                *(f"{kind}: {row['why']}" for kind, row in measured.items()),
-                f"{budget['steps']:,} steps, " + (f"{budget['updates']:,} updates" if returns else "no returns"),
-            ]
-        ),
+        **_whole(measured, budget),
         "budget": budget,
         "measured": measured,
         "seeds": sorted({cell.seed for cell in cells}),
@@ -133,6 +127,37 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     except UserError as error:  # a shared dataset may be read-only
         print(f"warning: {error}; the certificate is only in {out}", file=sys.stderr)
     return certificate
+
+
+def _whole(measured: Mapping[str, Row], budget: Mapping[str, int]) -> Row:
+    """Verdict over all measures, and why."""
+    verdicts = {row["verdict"] for row in measured.values()}
+    policies = f"{budget['updates']:,} updates" if "returns" in measured else "no returns"
+    why = [*(f"{kind}: {row['why']}" for kind, row in measured.items()), f"{budget['steps']:,} steps, {policies}"]
+    return {"verdict": verdicts.pop() if len(verdicts) == 1 else OPEN, "why": "; ".join(why)}
+
+
+def contradictions(folder: Path) -> list[str]:
+    """A sentence for each certificate of a folder whose id or verdict contradicts its own record.
+
+    UserError if the file is damaged.
+    """
+    file, found = folder / CERTIFICATES, []
+    for name, one in read_json(file).items() if file.exists() else ():
+        with damaged(f"{file}: {name}", "is damaged", "remove it, or write it again with `vd4rl-pomdp certify`"):
+            measured = {
+                kind: _gated(row) if kind == "returns" else _verdict(row, 1, 2) for kind, row in one["measured"].items()
+            }
+            rows = [
+                (one, _whole(measured, one["budget"])),
+                *((one["measured"][kind], measured[kind]) for kind in measured),
+            ]
+            if (computed := certificate_id(one["data"], one["corruption"])) != name:
+                found.append(f"certificate {name}: its record computes {computed}")
+            for stored, row in rows:
+                wrong = [(stored[key], value) for key, value in row.items() if stored[key] != value]
+                found += [f"certificate {name}: says {says!r}, its numbers {value!r}" for says, value in wrong]
+    return found
 
 
 def _r2(dataset: Dataset, runs: Sequence[Path]) -> np.ndarray:
@@ -164,12 +189,17 @@ def _returns(folders: Sequence[Path]) -> Row:
     share = float(found[STATE].mean() / data)
     row |= {"data_return": float(data), "state_share": share, "converged": converged(runs)}
     row["updates"] = min(run.result.record["config"]["updates"] for run in runs)
-    missed = []
-    if not share >= STATE_SHARE:
-        missed.append(f"state returns {share:.2f} of the data's return, less than {STATE_SHARE}")
+    return row | _gated(row)
+
+
+def _gated(row: Row) -> Row:
+    """Verdict and reason of returns: undecided if they miss a gate."""
+    found, missed = _verdict(row, row["data_return"], 0), []
+    if not row["state_share"] >= STATE_SHARE:
+        missed.append(f"state returns {row['state_share']:.2f} of the data's return, less than {STATE_SHARE}")
     if not row["converged"]:
         missed.append(f"critics are {'not known to have' if row['converged'] is None else 'not'} converged")
-    return row | ({"verdict": OPEN, "why": "; ".join([*missed, row["why"]])} if missed else {})
+    return {"verdict": OPEN, "why": "; ".join([*missed, found["why"]])} if missed else found
 
 
 def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
@@ -182,6 +212,13 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
     for floor in FLOORS:
         ends = difference_interval(values[MEMORY], values[floor]) or (None, None)
         above[floor] = (float(values[MEMORY].mean() - values[floor].mean()), *ends)
+    row = {"methods": methods, "above": above}
+    return row | _verdict(row, unit, digits)
+
+
+def _verdict(row: Row, unit: float, digits: int) -> Row:
+    """Verdict and reason of the means and differences that `judge` has found."""
+    methods, above = row["methods"], row["above"]
     known = all(low is not None for _, low, _ in above.values())
     weak = methods[MEMORY][0] < ENOUGH * unit
     mean, low, high = methods[MEMORY]
@@ -193,4 +230,4 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
     why = [f"{MEMORY} {with_interval(mean, low, high, digits)}"]
     why += [f"less {floor} {with_interval(mean, low, high, digits)}" for floor, (mean, low, high) in above.items()]
     why += ["too few seeds"] * (not known) + ["itself too low to judge"] * (weak and verdict == OPEN)
-    return {"methods": methods, "above": above, "verdict": verdict, "why": ", ".join(why)}
+    return {"verdict": verdict, "why": ", ".join(why)}

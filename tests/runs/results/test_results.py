@@ -100,7 +100,7 @@ def test_added_runs_are_unique_and_never_replaced(tmp_path, capsys):
     whole_run(run, score=3.0)
     write_json(tmp_path / "runs/1/timing.json", {"seconds": 1.0})
     main(words)
-    assert "1 run added, 1 there already with other rows, which stay" in capsys.readouterr().out
+    assert "1 run added, 1 there already with other rows or records, which stay" in capsys.readouterr().out
     assert [content(one) for one in read_results(tmp_path / "out")][:1] == before
     main(["results", "add", str(tmp_path / "out"), "--out", str(tmp_path / "copy")])
     main([*words[:3], "--out", str(tmp_path / "copy")])
@@ -171,17 +171,61 @@ def test_later_evaluations_are_added(tmp_path):
     assert add_results([run], tmp_path / "out") == "0 runs added, 1 there already, with later evaluations added"
     for out in ("report", "out"):
         assert read_results(tmp_path / out)[0].rows == read_run(run).rows
+    copy, taken = shutil.copytree(run, tmp_path / "copy"), shutil.copytree(earlier, tmp_path / "taken")
+    write_json(copy / "config.json", read_json(copy / "config.json") | {"git_commit": "another"})
+    assert add_results([copy], taken) == "0 runs added, 1 there already, with later evaluations added"
+    assert content(*read_results(taken)) == content(*read_results(tmp_path / "out")), "only rows are added"
+    write_json(copy / "critic.json", {"value": 150.0, "moved": 0.05, "data": 160.0})
+    taken = shutil.copytree(earlier, tmp_path / "other")
+    assert add_results([copy], taken).startswith("0 runs added, 1 there already with other rows or records")
+    assert content(*read_results(taken)) == content(*read_results(earlier))
     assert add_results([earlier], tmp_path / "out") == "0 runs added, 1 there already"
     assert len(read_results(tmp_path / "out")[0].rows) == 3
     assert [found.path for found in find_results([tmp_path / "out", earlier])] == [tmp_path / "out"]
-    with pytest.raises(UserError, match="report: holds other rows of run"):
+    with pytest.raises(UserError, match="report: holds other rows or records of run"):
         write_report([earlier], tmp_path / "report")
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("critic.json", '{"value": 150.0, "moved": 0.5, "data": 160.0}'),
+        ("reference.json", '{"data_return": 50.0, "actor": null, "path_error": 0.01, "mean_reward": 1.0}'),
+        ("probe.json", '{"probe_pose": 1.5, "probe_velocity": null}'),
+        ("results.json", '{"rows": [], "seconds": 2.0}'),
+        ("metrics.jsonl", '{"step": 1, "action_loss": 0.1}\n{"step": 2, "action_loss": 0.25}\n'),
+    ],
+)
+def test_copies_with_other_measures_are_rejected(tmp_path, file, text):
+    """Else the order of the paths would decide verdicts."""
+    run = (pretraining if file == "metrics.jsonl" else whole_run)(tmp_path / "run")
+    if file == "results.json":
+        write_json(run / file, {"rows": [], "seconds": 1.0})
+    add_results([run], tmp_path / "out")
+    before = (tmp_path / "out" / "runs.jsonl").read_bytes()
+    (run / file).write_text(text)
+    for paths in ([run, tmp_path / "out"], [tmp_path / "out", run]):
+        with pytest.raises(UserError, match="two runs with the same method, setting and seed"):
+            find_results(paths)
+    assert add_results([run], tmp_path / "out").startswith("0 runs added, 1 there already with other rows or records")
+    if file != "metrics.jsonl":
+        with pytest.raises(UserError, match="out: holds other rows or records of run"):
+            write_report([run], tmp_path / "out")
+    assert (tmp_path / "out" / "runs.jsonl").read_bytes() == before
+
+
+def test_copy_with_more_files_is_read_in_any_order(tmp_path):
+    add_results([whole_run(tmp_path / "run")], tmp_path / "whole")
+    (tmp_path / "run" / "critic.json").unlink()
+    add_results([tmp_path / "run"], tmp_path / "less")
+    for paths in ([tmp_path / "whole", tmp_path / "less"], [tmp_path / "less", tmp_path / "whole"]):
+        assert ["critic" in run.files for run in find_results(paths)] == [True]
 
 
 def test_report_does_not_replace_rows_of_a_finished_run(tmp_path):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "kept")
     before = (tmp_path / "kept" / "episodes.csv").read_bytes()
-    with pytest.raises(UserError, match=r"kept: holds other rows of run \w+, which would be lost"):
+    with pytest.raises(UserError, match=r"kept: holds other rows or records of run \w+, which would be lost"):
         write_report([whole_run(tmp_path / "again/0", score=3.0)], tmp_path / "kept")
     assert (tmp_path / "kept" / "episodes.csv").read_bytes() == before
     write_report([tmp_path / "runs"], tmp_path / "kept")

@@ -1,7 +1,9 @@
 """`results verify`: contradictions between rows and records are reported, and episodes replay exactly."""
 
 import json
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.results import add_results, read_results, verify_results
+from vd4rl_pomdp.runs.results import add_results, read_results, verify_results, write_results
+from vd4rl_pomdp.runs.run import identity
 
 COMMITTED = Path(__file__).parents[3] / "results"
 
@@ -95,7 +98,10 @@ EDITED_ROWS = [
     (3, {"evaluated_under": "none"}, f"at step 40 under {OWN} it has the episodes [0], its record 2, from 0 on"),
     (4, {"evaluated_under": "glitch"}, "at step 40 under none it has the episodes [], its record 1, from 0 on"),
     (0, {"episode_seed": "20007"}, "1 environment seeds are not those of their numbers"),
-    (0, {"length": "5"}, "1 lengths are not within 1 and 4"),
+    (0, {"length": "5"}, "1 lengths are not 4"),
+    (0, {"length": "3"}, "1 lengths are not 4"),
+    (0, {"return": "8.5", "score": "0.85"}, "1 returns are not within 0 and 2 per decision"),
+    (0, {"return": "-5.0", "score": "-0.5"}, "1 returns are not within 0 and 2 per decision"),
     (0, {"quality": "medium"}, "an episode has the quality medium, its record expert (1 such)"),
     (0, {"corruption": "none"}, "an episode has the corruption none, its record patch+zero_frames (1 such)"),
     (0, {"action_error": "0.1"}, "1 action errors are missing, or present without an actor"),
@@ -113,7 +119,9 @@ EDITED_RECORDS = [
     (("encoder", "pretrain", "corruption", "patch_size"), 24, "its encoder says patch_size 24, its settings 16"),
     (("critic", "data"), 1.0, "its critic.json has data value 1.0, but mean reward"),
     (("reference", "mean_reward"), 1.0, "but mean reward 1.0 gives 100.0000"),
+    (("episodes",), 3, "2 rows more than runs.jsonl says"),
 ]
+COLLECTED = {"task": "walker_walk", "quality": "expert", "action_noise": None}
 
 
 def test_verify_finds_manual_edits(data, encoder, tmp_path):
@@ -146,6 +154,78 @@ def test_verify_finds_manual_edits(data, encoder, tmp_path):
     (results / "episodes.csv").write_text(head)
     found = changed(results, lambda line: line.update(episodes=0))
     assert len(found) == 3, "two evaluations and an uncorrupted one"
+
+
+def test_verify_compares_labels_and_returns_with_the_data(results):
+    def edit(line: dict[str, Any]) -> None:
+        line["config"]["collection"] = COLLECTED
+        line["reference"] |= {"data_return": total}
+        line["labels"] |= labels
+
+    total, labels = 500.0, {}
+    assert changed(results, edit) == []
+    total = 250.0
+    assert [one.partition(": ")[2] for one in changed(results, edit)] == [
+        "its data return 250.0, but 500 times the mean reward 1.0 is 500.0000"
+    ]
+    total, labels = 500.0, {"quality": "medium"}
+    assert "its labels have the quality medium, its data were collected as expert" in changed(results, edit)[0]
+
+
+def test_verify_finds_repeated_and_foreign_rows(results):
+    path = results / "episodes.csv"
+    text = path.read_text()
+    first = read_results(results)[0]
+    lines = text.splitlines(keepends=True)
+    path.write_text(text + lines[1] + lines[1].replace(first.id, "f00"))
+    assert verify_results(results)[1] == [
+        f"run {first.id}: 1 rows more than runs.jsonl says",
+        "run f00: 1 rows more than runs.jsonl says",
+    ]
+    path.write_text(text)
+
+
+def test_verify_finds_a_run_copied_as_another_seed(tmp_path):
+    run = next(run for run in read_results(COMMITTED / "protocol") if run.labels["method"] == "mik+a" and run.rows)
+    files = json.loads(json.dumps(run.files))
+    for part in (files["labels"], files["config"]["config"], files["encoder"]["pretrain"]):
+        part["seed"] = 9
+    copy = replace(run, files=files, rows=[row | {"seed": 9} for row in run.rows])
+    copy = replace(copy, id=identity(copy.record, copy.card))
+    write_results(tmp_path, [run, copy])
+    assert verify_results(tmp_path)[1] == [f"run {copy.id}: all its returns are those of run {run.id}, another seed"]
+
+
+@pytest.mark.parametrize(("name", "key"), [("reference", "data_return"), ("probe", "probe_pose")])
+def test_numbers_that_are_not_finite_are_rejected(results, name, key):
+    with pytest.raises(UserError, match=r"runs.jsonl: line 1: its files are damaged \(its probe or reference is not"):
+        changed(results, lambda line: line[name].update({key: float("nan")}))
+
+
+CERTIFICATES = [
+    (lambda text: "[]", "is not a JSON object"),
+    (lambda text: '{"f00": {"data": 1}}', "f00: is damaged"),
+    (lambda text: text.replace("1476f56a", "f00"), "its record computes 1476f56a3f00ac8172cb91e8"),
+    (lambda text: text.replace('"zeroed_frames": 2', '"zeroed_frames": 1'), "its record computes"),
+    (
+        lambda text: text.replace('"verdict": "needs a', '"verdict": "needs no'),
+        "says 'needs no memory of what was seen'",
+    ),
+    (lambda text: text.replace("supervised+a 0.78", "supervised+a 0.98"), "says 'R2: supervised+a 0.98"),
+    (lambda text: text.replace("0.0533", "-0.0533"), "its numbers 'undecided'"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), CERTIFICATES)
+def test_verify_recomputes_certificates(tmp_path, capsys, change, words):
+    folder = shutil.copytree(COMMITTED / "protocol", tmp_path / "protocol")
+    main(["results", "verify", str(folder)])
+    file = folder / "certificates.json"
+    file.write_text(change(file.read_text()))
+    with pytest.raises(SystemExit) as ended:
+        main(["results", "verify", str(folder)])
+    assert ended.value.code == 2
+    assert words in "".join(capsys.readouterr())
 
 
 def test_changeable_settings_are_recorded_as_of_the_end(data, encoder, tmp_path, monkeypatch):

@@ -166,7 +166,7 @@ def test_report_lists_differing_settings(tmp_path):
     for run in (*alike, untrained):
         change(run / "results.json", set="set of more")
         change(run / "config.json", collection={"trajectories": 300, "trajectory_rows": 500})
-    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    page = write_report([tmp_path / "runs"], tmp_path / "changed").read_text()
     assert "Not alike in `no_curtain`: steps is 2500, but 9000 in `no_history-K15`." in page
     assert "set is set of m, but f00 in `mik+a-K15-sp`, `no_history-K15`." in page
     assert "on 150,000 samples" in page
