@@ -40,8 +40,10 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
         length = min(config["eval_length"], TASKS.named(about.task).decisions)
         under = own_and_none(CorruptionConfig.fill(about.corruption))
         write_rounded(run, made)
+        data = {"data": trained.record["inputs"]["data"], "quality": trained.labels["quality"]}
+        before = {name: value for name in data if (value := getattr(about, name)) != data[name]}
         card = {name: trained.labels[name] for name in LABELS} | {
-            "data": trained.record["inputs"]["data"],
+            "data": data["data"],
             "corruption": about.corruption,
             "budget": {
                 "pretraining": {
@@ -49,6 +51,7 @@ def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> 
                     "steps": about.steps,
                     "frames": encoder.frames,
                     "seed": about.seed,
+                    **before,  # of the encoder, if the policy was trained on other data
                 },
                 "finetuning": {"preset": config["preset"], "updates": trained.files["timing"].get("updates")},
             },

@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
 import pretrain.objectives  # noqa: F401
+from vd4rl_pomdp.agents import checksums
 from vd4rl_pomdp.core.registry import REGISTRIES
+from vd4rl_pomdp.nn.encoder import EncoderCard
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = {f"my_{page.stem.split('_', 2)[2]}.py": page for page in sorted(DOCS.glob("add_a*.md"))}
@@ -43,3 +46,10 @@ def isolated_registries() -> Iterator[None]:
         for registry in REGISTRIES.values():
             stack.enter_context(registry.isolated())
         yield
+
+
+def agent_card(encoder: EncoderCard, folder: Path) -> dict[str, Any]:
+    """A card of the agent in a folder, without episodes."""
+    card = {name: getattr(encoder, name) for name in ("task", "quality", "method", "corruption", "data")}
+    card |= {"algorithm": "td3_bc", "seed": 0, "length": 20, "budget": {"pretraining": {"seed": encoder.seed}}}
+    return card | {"sha256": checksums(folder)}

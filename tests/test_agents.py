@@ -128,13 +128,22 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
         with pytest.raises(UserError, match=r"its files do not match card\.json"):
             load_agent(out)
         (out / name).write_bytes(whole)
-    for damaged in (
-        {"task": card["task"]},
-        *(card | {name: None} for name in ("task", "method", "corruption", "sha256")),
-    ):
-        write_json(out / "card.json", damaged)
+    damages = [{"sha256": None}, {"quality": "medium"}, {"data": "f00"}, {"method": "acro"}, {"task": "cheetah_run"}]
+    pretraining = card["budget"]["pretraining"]
+    damages += [{"budget": {"pretraining": pretraining | {name: 7}}} for name in ("seed", "steps")]
+    for damaged in damages:
+        write_json(out / "card.json", card | damaged)
         with pytest.raises(UserError, match=r"its files do not match card\.json"):
             load_agent(out)
+    of_encoder = {"pretraining": pretraining | {name: card[name] for name in ("data", "quality")}}
+    write_json(out / "card.json", card | {"data": "f00", "quality": "medium", "budget": of_encoder})
+    assert load_agent(out).card["data"] == "f00", "a policy trained on other data than its encoder"
+    for name in ("task", "method", "corruption", "quality", "data", "seed", "length", "budget"):
+        without = {key: value for key, value in card.items() if key != name}
+        for damaged, value in ((without, None), (card | {name: 0.5}, 0.5)):
+            write_json(out / "card.json", damaged)
+            line = rejection(["agents", "play", str(out), "--episodes", "1"])
+            assert f"{out / 'card.json'}: its {name} is {value}; use another copy" in line
 
 
 def test_play_prints_return_of_first_agent_less_that_of_each_other(monkeypatch, capsys):

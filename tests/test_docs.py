@@ -19,8 +19,8 @@ from pretrain.objectives import METHODS
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_pages import PAGES as EXAMPLES
-from tests.helpers_pages import isolated_registries, load_example
-from vd4rl_pomdp.agents import checksums, write_rounded
+from tests.helpers_pages import agent_card, isolated_registries, load_example
+from vd4rl_pomdp.agents import write_rounded
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
@@ -237,8 +237,7 @@ def write_agent(run: Path, folder: Path) -> None:
     encoder, card = load_encoder(run / "encoder")
     Policy(encoder.dim, 6, 8).save(run / "policy")
     write_rounded(run, folder)
-    about = {"task": card.task, "method": card.method, "corruption": card.corruption, "sha256": checksums(folder)}
-    write_json(folder / "card.json", about)
+    write_json(folder / "card.json", agent_card(card, folder))
 
 
 def check_results(page: str, names: dict) -> None:

@@ -15,9 +15,10 @@ import yaml
 from tests.helpers_bad_input import rejection
 from tests.helpers_data import write_fake_set
 from tests.helpers_hub import TOKEN, Hub, Repo
+from tests.helpers_pages import agent_card
 from tests.nn.test_encoder import CARD, make
 from vd4rl_pomdp import load_agent
-from vd4rl_pomdp.agents import checksums, write_rounded
+from vd4rl_pomdp.agents import write_rounded
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.hub import LISTING, pull, push
@@ -121,8 +122,7 @@ def test_hub_cards_show_license_and_loading_code(hub, encoder, data, monkeypatch
 def test_agent_round_trip_over_the_hub(hub, encoder, tmp_path):
     Policy(12, 6, 8).save(encoder.parent / "policy")
     write_rounded(encoder.parent, tmp_path / "agent")
-    about = {"task": CARD.task, "method": CARD.method, "corruption": CARD.corruption, "run": "r00"}
-    write_json(tmp_path / "agent" / "card.json", about | {"sha256": checksums(tmp_path / "agent")})
+    write_json(tmp_path / "agent" / "card.json", agent_card(CARD, tmp_path / "agent") | {"run": "r00"})
     push(encoder, ENCODER)
     push(tmp_path / "agent", ENCODER)  # replaces the encoder
     assert set(hub.files(WHERE[ENCODER])) == {*content(tmp_path / "agent"), "README.md", LISTING, ".gitattributes"}
@@ -132,6 +132,9 @@ def test_agent_round_trip_over_the_hub(hub, encoder, tmp_path):
     assert load_agent(tmp_path / "new").card["run"] == "r00"
     readme = hub.files(WHERE[ENCODER])["README.md"].decode()
     assert yaml.safe_load(readme.split("---\n")[1])["license"] == "mit"
+    write_json(tmp_path / "agent" / "card.json", agent_card(replace(CARD, seed=7), tmp_path / "agent"))
+    with pytest.raises(UserError, match=r"its files do not match card\.json"):
+        push(tmp_path / "agent", ENCODER)
     (tmp_path / "agent" / "policy" / "config.json").write_text("{}")
     with pytest.raises(UserError, match=r"its files do not match card\.json"):
         push(tmp_path / "agent", ENCODER)

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metadata
+from vd4rl_pomdp.core.reading import damaged, fits, read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, Task
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.make import layout_of
@@ -33,6 +33,11 @@ CARD = "card.json"
 FILES = tuple(f"{part}/{name}" for part in ("encoder", "policy") for name in ("config.json", "model.safetensors"))
 """An agent's files other than its card."""
 SHIPPED = Path(__file__).parent
+_KINDS = {
+    **dict.fromkeys(("method", "task", "quality", "algorithm", "data"), str),
+    **{"corruption": dict, "seed": int, "budget": dict, "length": int},
+}
+"""Types of entries that every card has."""
 
 
 class Agent:
@@ -90,8 +95,15 @@ def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
             f"agent ({', '.join(shipped()) or 'none'})"
         )
     card = read_json(folder / CARD)
+    for name, kind in _KINDS.items():
+        if not fits(card.get(name), kind):
+            raise UserError(f"{folder / CARD}: its {name} is {card.get(name)!r}; use another copy")
+    # if the policy was trained on other data than the encoder, the budget names the encoder's
+    own = {name: card[name] for name in ("task", "method", "corruption", "data", "quality")}
+    with damaged(folder / CARD, "its budget has no pretraining", "use another copy"):
+        own |= {"seed": None} | card["budget"]["pretraining"]
     about = read_json(folder / FILES[0]).get("pretrain", {}) if card.get("sha256") == checksums(folder) else {}
-    if not about or any(card.get(name) != about[name] for name in ("task", "method", "corruption")):
+    if not about or any(about[name] not in ("", value) for name, value in own.items() if name in about):
         raise UserError(f"{folder}: its files do not match {CARD}; use another copy")
     return folder, card
 

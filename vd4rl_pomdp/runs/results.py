@@ -457,7 +457,8 @@ def _contradictions(run: Result) -> Iterator[str]:
             if trained[name] != card["settings"][name]:
                 yield f"its encoder says {name} {trained[name]}, its settings {card['settings'][name]}"
         reference, task = run.files.get("reference", {}), _shipped(run)
-        data, mean = run.files.get("critic", {}).get("data"), reference.get("mean_reward")
+        data: Any = run.files.get("critic", {}).get("data")
+        mean: Any = reference.get("mean_reward")
         plan = run.record.get("collection") or {}
         if {"task", "quality"} <= plan.keys():
             noise = f"_noise{plan['action_noise']:g}" if plan.get("action_noise") else ""
@@ -465,7 +466,8 @@ def _contradictions(run: Result) -> Iterator[str]:
                 if run.labels[name] != made:
                     yield f"its labels have the {name} {run.labels[name]}, its data were collected as {made}"
             # a set of shorter episodes is one for tests, whose evaluations are shorter, too
-            total, n = reference.get("data_return"), task.decisions if task else 0
+            total: Any = reference.get("data_return")
+            n = task.decisions if task else 0
             whole = n > 0 and config.get("eval_length", n) >= n and None not in (mean, total)
             if whole and abs(total - mean * n) > n * 2e-6:
                 yield f"its data return {total}, but {n} times the mean reward {mean} is {n * mean:.4f}"
