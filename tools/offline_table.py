@@ -74,9 +74,13 @@ def main_runs() -> list[Run]:
     return found
 
 
-def runs_of(grids: Sequence[str], folders: Sequence[str]) -> list[Run]:
-    """Finished fine-tuning runs of some grids (names or TOML files), from results folders, since grids share cells."""
-    cells = [cell for name in grids for cell in load_grid(name).cells()]
+def runs_of(grids: Sequence[str], folders: Sequence[str], changes: Sequence[str] = ()) -> list[Run]:
+    """Finished fine-tuning runs of some grids (names or TOML files), from results folders, since grids share cells.
+
+    Also those of each grid with one of the `changes`, such as "finetune.updates=100".
+    """
+    kinds = [[], *([change] for change in changes)]
+    cells = [cell for name in grids for kind in kinds for cell in load_grid(name, kind).cells()]
     found = load_runs([RESULTS / name for name in folders], choice=GridMembers(" and ".join(grids), cells))
     return [run for run in found if run.rows and run.finished]
 

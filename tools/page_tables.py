@@ -26,7 +26,7 @@ Tables = dict[str, Iterable[str]]
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, by the page's path in the repository."""
-    frozen = offline.runs_of([str(ROOT / "results" / "protocol.toml")], ["protocol"])
+    frozen = offline.runs_of([str(ROOT / "results" / "protocol.toml")], ["protocol"], protocol.SECOND_BUDGETS)
     methods, returns = offline.runs_of(["methods"], ["methods", "offline", "control"]), offline.main_runs()
     numbers, rungs, condition = mazes.numbers_in(), ladder.cells_in(), mazes.Condition("", "")
     by_k = [(f"K = {k}", condition._replace(max_k=k)) for k in (15, 1)]

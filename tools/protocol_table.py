@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from operator import itemgetter
 
 import numpy as np
 from offline_table import CLEAN, mean_text
 
 from vd4rl_pomdp.core.text import table_lines
-from vd4rl_pomdp.report.gates import EXPLORATORY, PRIMARY, UNJUDGED, episodes_of, gates, judge_claims, unranked
+from vd4rl_pomdp.report.gates import (
+    EXPLORATORY,
+    PRIMARY,
+    UNJUDGED,
+    episodes_of,
+    gates,
+    judge_claims,
+    opposite,
+    unranked,
+)
 from vd4rl_pomdp.report.load import PROBES, Run, label
 from vd4rl_pomdp.report.stats import number, with_interval
 from vd4rl_pomdp.runs.files import groups
@@ -29,25 +39,34 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
     return table_lines(head, rows, (0, 1))
 
 
+SECOND_BUDGETS = ("finetune.updates=120000", "finetune.updates=160000")
+"""Changes of the grid for twice the updates: the walker's, the cheetah's."""
 LEAST_SEEDS = 4
 """Seeds of both methods of a primary contrast, of five, without which it is not judged."""
 
 
 def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """The contrasts that the protocol tests, with Holm's p values and verdicts."""
-    rows = []
+    """The contrasts that the protocol tests, with Holm's p values and verdicts; one row per budget."""
+    found = []
     for row in judge_claims(list(runs), unranked(gates(list(runs)))):
-        if row["family"] in ("", EXPLORATORY):
-            continue
-        found, clean = (
+        few = row["family"] == PRIMARY and min(row["left_seeds"], row["right_seeds"]) < LEAST_SEEDS
+        if row["family"] not in ("", EXPLORATORY):
+            found.append(row | {"verdict": f"{UNJUDGED}missing seeds" if few else row["verdict"]})
+    place = itemgetter("claim", "task", "quality", "corruption")
+    rows, same_claim = [], groups(found, place)
+    for row in found:
+        shown, clean = (
             with_interval(row[f"{kind}difference"], row[f"{kind}low"], row[f"{kind}high"], 0) for kind in ("", "clean_")
         )
+        share = f" ({100 * row['smallest_share']:.0f}%)" if row["smallest_share"] else ""
+        notes = ["opposite sign evaluated clean"] * opposite(row)
+        judged = {other["verdict"] for other in same_claim[place(row)]}
+        judged = {verdict for verdict in judged if not verdict.startswith(UNJUDGED)}
+        notes += ["depends on the budget"] * (len(judged) > 1)
         setting = ", ".join(row[name] for name in ("task", "quality", "corruption"))
         sides = f"`{row['left']}` minus `{row['right']}`"
-        seeds = row["left_seeds"], row["right_seeds"]
-        few = row["family"] == PRIMARY and min(seeds) < LEAST_SEEDS
-        verdict = f"{UNJUDGED}missing seeds" if few else row["verdict"]
-        tested = (number(row["adjusted_p"], 3), number(row["smallest"], 0), verdict)
-        rows.append((setting, sides, ", ".join(map(str, seeds)), found, clean, *tested))
+        seeds = f"{row['left_seeds']}, {row['right_seeds']}"
+        tested = number(row["adjusted_p"], 3), number(row["smallest"], 0) + share, "; ".join([row["verdict"], *notes])
+        rows.append((setting, sides, seeds, shown, clean, *tested))
     head = ("setting", "contrast", "n", "difference", "evaluated clean", "p (Holm)", "detectable", "verdict")
     return table_lines(head, rows, (0, 1, 7))

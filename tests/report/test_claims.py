@@ -1,5 +1,7 @@
 """Verdicts on the paper's claims, on runs with given returns."""
 
+import importlib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +129,48 @@ def test_holm_correction_applies_within_claim_families(tmp_path):
     assert [row for row in with_another if row["algorithm"] == "td3_bc"] == [*rows.values()], "each setting by itself"
 
 
+def test_every_budget_has_its_own_verdicts(tmp_path):
+    """Even if returns differ: choosing the budget by returns would bias the contrast."""
+    scores = {("acro", "patch"): (20, 22, 21), ("mik", "patch"): (31, 36, 32), ("mik+a", "patch"): (33, 41, 38)}
+    twice = {("acro", "patch"): (45, 47, 46), ("mik", "patch"): (30, 60, 40), ("mik+a", "patch"): (60, 64, 63)}
+    write(tmp_path / "one", scores)
+    write(tmp_path / "two", twice)
+    for run in (tmp_path / "two").iterdir():
+        record = read_json(run / "config.json")
+        write_json(run / "config.json", record | {"config": record["config"] | {"updates": 20}})
+    both = judge_claims(load_runs([tmp_path]))
+    for folder, updates in (("one", 10), ("two", 20)):
+        alone = judge_claims(load_runs([tmp_path / folder]))
+        mine = [row for row in both if f"updates {updates}" in row["left"] and row["family"] == "primary"]
+        assert len(mine) == 3
+        for row, expected in zip(mine, (row for row in alone if row["family"] == "primary"), strict=True):
+            for name in ("claim", "left_return", "right_return", "p", "adjusted_p", "verdict"):
+                assert row[name] == expected[name]
+    assert [row["verdict"] for row in both if row["claim"] == ACTIONS] == ["undecided", "undecided"]
+    assert [row["verdict"] for row in both if row["claim"] == MEMORY] == ["holds", "undecided"]
+
+
+def test_protocol_table_has_a_row_per_budget(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "tools")
+    lines = importlib.import_module("protocol_table").contrast_lines
+    scores = {("acro", "patch"): (20, 22, 21, 23), ("mik", "patch"): (31, 34, 32, 30)}
+    for name, more in (("one", 0), ("two", 10)):
+        write(tmp_path / name, scores | {("acro", "patch"): tuple(one + more for one in scores["acro", "patch"])})
+        for run in (tmp_path / name).iterdir():
+            record = read_json(run / "config.json")
+            write_json(run / "config.json", record | {"config": record["config"] | {"updates": 10 + more}})
+            rows = [row for row in read_episodes(run / "episodes.csv") if row["step"] == 10]
+            clean = {"evaluated_under": "none", "return": 10.0 * (run.name.startswith("acro") + rows[0]["seed"])}
+            append_episodes(run / "episodes.csv", [row | clean for row in rows])
+    monkeypatch.setattr("protocol_table.unranked", lambda rows: [])
+    *_, one, two = lines(load_runs([tmp_path]))
+    assert "| `mik, updates 10` minus `acro, updates 10` | 4, 4 | 102 [" in one
+    assert "| holds; opposite sign evaluated clean; depends on the budget |" in one
+    assert "| `mik, updates 20` minus `acro, updates 20` | 4, 4 | 2 [" in two
+    assert "| undecided; opposite sign evaluated clean; depends on the budget |" in two
+    assert re.search(r"\| \d+ \(\d+%\) \|", one)
+
+
 def test_seeds_with_individual_sets_are_compared(tmp_path):
     on_own_sets(write(tmp_path / "one", GOOD), first=100)
     assert judged(tmp_path / "one")[BOTH]["verdict"] == "holds"
@@ -148,6 +192,7 @@ def test_claims_include_clean_evaluations(tmp_path):
     row = judged(tmp_path)[MEMORY]
     assert (row["verdict"], row["difference"]) == ("holds", pytest.approx(110))
     assert (row["clean_difference"], row["clean_low"] < row["clean_high"] < 0) == (pytest.approx(-400), True)
+    assert "holds; opposite sign evaluated clean" in write_report([tmp_path], tmp_path / "out").page.read_text()
 
 
 def test_claims_ignore_variants_of_methods(tmp_path):

@@ -190,6 +190,16 @@ def test_unconverged_critic_leaves_setting_undecided(tmp_path, who, moved):
     assert patch_gate(tmp_path)["verdict"] == "discriminates"
 
 
+@pytest.mark.parametrize(("method", "words"), [("random", "random"), ("mik+a", "best")])
+def test_critic_without_a_partner_counts(tmp_path, method, words):
+    """Where only one side of the third gate was measured, its critic is still one of the setting's."""
+    grid(tmp_path, {name: seeds for name, seeds in GOOD.items() if name in (("state", "patch"), (method, "patch"))})
+    move(tmp_path, method, "patch", 0.0222)
+    row = patch_gate(tmp_path)
+    assert row["converged"] is False
+    assert row["verdict"] == f"undecided at this budget: critics had not converged ({words})"
+
+
 def test_unused_critics_do_not_affect_verdict(tmp_path):
     grid(tmp_path, GOOD)
     move(tmp_path, "acro", "patch", 0.5)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -47,6 +47,8 @@ UNJUDGED = "not judged: "  # how a verdict begins where nothing is judged, befor
 NOT_REFUTED = "not refuted"  # verdict of an undecided "not below" claim
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
 DISTANCE = "distance"  # kind of a row that is a measurement, not a claim
+BUDGET = ("updates", "hidden_dim", "steps")
+"""Settings by which a setting's claims are adjusted separately: of the policy, and steps of the pretraining."""
 LEADER, OTHER = "mik+a", "acro"
 OTHERS = {"mik+a minus acro": "method", "mik+a minus acro with a GRU": "gru"}
 """What the leader is compared with, by the difference's name: the other method's `--history`."""
@@ -80,7 +82,8 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
     learned, floor = judged(run for run in here if run.method not in REFERENCES), as_it_is("random", here)
     above, (low, high) = difference(compared := sides(learned, floor))
     data = {value for run in here if (value := run.reference.data_return) is not None}
-    everyone = {"state": state, "acro under none": acro, "best": compared.left, "random": compared.right}
+    everyone = {"state": state, "acro under none": acro}
+    everyone |= {"best": compared.left or best_of(learned), "random": compared.right or best_of(floor)}
     bar, source = pixel_bar(key[0], key[1], [run.reference.data_return for run in acro or here])
     row: Row = dict(zip(GATED, key, strict=True)) | {
         "data_return": float(np.mean(sorted(data))) if data else None,
@@ -205,10 +208,14 @@ def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
 
     Prefers pairs with equal settings, then with more than one seed on both sides, then with the highest returns.
     """
+    pairs = _pairs(left, right)
+    chosen = [pair for pair in pairs if not pair.unlike] or pairs
+    return max(chosen, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
+
+
+def _pairs(left: Iterable[Run], right: Iterable[Run]) -> list[Sides]:
     others = seeds_by_variant(right)
-    pairs = [Sides(one, other, _unlike(one, other)) for one in seeds_by_variant(left) for other in others]
-    alike = [pair for pair in pairs if not pair.unlike]
-    return max(alike or pairs, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
+    return [Sides(one, other, _unlike(one, other)) for one in seeds_by_variant(left) for other in others]
 
 
 def seeds_by_variant(runs: Iterable[Run]) -> list[list[Run]]:
@@ -307,37 +314,45 @@ CLAIMS = (
 
 
 def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
-    """One row with a `verdict` per claim and setting in which both sides have finished runs.
+    """One row with a `verdict` per claim, setting and pair of variants with equal settings, such as those of a budget.
 
     `difference` is the left side's mean return minus the right's, `low` and `high` its 95% interval, `p` its two-sided
-    p value; columns with `clean_` are the same without corruption. A claim of a family is judged by `adjusted_p`, an
-    exploratory one by `p`. `smallest` is the difference that a 5% test with this standard error detects with 80% power;
-    `smallest_share` is the same as a fraction of the data's return. If the sides have no runs with equal settings,
-    these are None and the verdict names the differences. Nothing is judged unless the critics of both sides are known
-    to have converged, nor in settings that are `unranked`.
+    p value; columns with `clean_` are the same without corruption. A claim of a family is judged by `adjusted_p`,
+    adjusted within a BUDGET, an exploratory one by `p`. `smallest` is the difference that a 5% test with this standard
+    error detects with 80% power; `smallest_share` is the same as a fraction of the data's return. If the sides have no
+    runs with equal settings, these are None and the verdict names the differences. Nothing is judged unless the critics
+    of both sides are known to have converged, nor in settings that are `unranked`.
     """
     finished = comparable(runs)
     places = sorted({run.of(GATED) for run in finished})
-    found = [one for claim in CLAIMS for place in places if (one := _compared(claim, place, finished)) is not None]
-    tested = (row for row, _ in found if row["family"] in (PRIMARY, SECOND) and row["p"] is not None)
-    for family in groups(tested, lambda row: (row["family"], *_place(row))).values():
-        for row, adjusted in zip(family, stats.holm([row["p"] for row in family]), strict=True):
+    found = [one for claim in CLAIMS for place in places for one in _compared(claim, place, finished)]
+    tested = (one for one in found if one[0]["family"] in (PRIMARY, SECOND) and one[0]["p"] is not None)
+    for family in groups(tested, lambda one: (one[0]["family"], *_place(one[0]), _budget(one[1]))).values():
+        for (row, _), adjusted in zip(family, stats.holm([row["p"] for row, _ in family]), strict=True):
             row["adjusted_p"] = adjusted
     return [row | {"verdict": _verdict(row, compared, _place(row) in unranked)} for row, compared in found]
 
 
-def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tuple[Row, Sides] | None:
-    """A claim in a setting, not judged yet, and its comparison; None if a side has no run."""
+def _budget(compared: Sides) -> tuple[str | None, ...]:
+    return tuple(compared.left[0].settings.get(name) for name in BUDGET)
+
+
+def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> Iterator[tuple[Row, Sides]]:
+    """A claim in a setting, not judged yet, and its comparisons; none if a side has no run."""
     if claim.hidden == (place[2] == "none"):
-        return None
+        return
     alike, chosen = on_set(place, runs), []
     for side, other in ((claim.left, claim.right), (claim.right, claim.left)):
         seen = seen_under("none" if side.clean else place[2], alike)
         others = judged(run for run in seen if run.method not in (other.method, *REFERENCES))
         chosen.append(as_it_is(side.method, seen, side.history) if side.method else others)
-    compared = sides(*chosen) if claim.right.method else _decisive(*chosen)
-    if not compared.left:
-        return None
+    pairs = [pair for pair in _pairs(*chosen) if not pair.unlike] or [sides(*chosen)]
+    for compared in pairs if claim.right.method else [_decisive(*chosen)]:
+        if compared.left:
+            yield _row(claim, place, compared), compared
+
+
+def _row(claim: ReturnClaim, place: tuple[str, ...], compared: Sides) -> Row:
     row: Row = {"claim": claim.text, "kind": claim.kind, "family": "" if claim.kind == DISTANCE else claim.family}
     row |= dict(zip(GATED, place, strict=True))
     for name, seeds in (("left", compared.left), ("right", compared.right)):
@@ -352,7 +367,7 @@ def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> tu
     smallest = found and found.smallest
     row |= {"p": found and found.p, "adjusted_p": None, "smallest": smallest, "data_return": mean}
     row["smallest_share"] = smallest / mean if smallest and mean and mean > 0 else None
-    return row, compared
+    return row
 
 
 def _decisive(left: list[Run], others: list[Run]) -> Sides:
@@ -384,6 +399,13 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
     sign = HOLDS if row["difference"] > 0 else FAILS
     found = FEW if p is None else sign if p < stats.LEVEL else OPEN
     return NOT_REFUTED if found == OPEN and row["kind"] == "not below" else found
+
+
+def opposite(row: Row) -> bool:
+    """Whether the difference of a claim with a verdict has the other sign where nothing is hidden in evaluation."""
+    if not row["verdict"]:
+        return False
+    return None not in (row["difference"], row["clean_difference"]) and row["difference"] * row["clean_difference"] < 0
 
 
 def tally(rows: list[Row]) -> str:

@@ -24,7 +24,7 @@ from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, load, tables
 from vd4rl_pomdp.report.figures import Plot, draw_plots, seeds_note
 from vd4rl_pomdp.report.films import shown_films
-from vd4rl_pomdp.report.gates import gates, judge_claims, leads, tally, unranked, verdicts
+from vd4rl_pomdp.report.gates import gates, judge_claims, leads, opposite, tally, unranked, verdicts
 from vd4rl_pomdp.report.load import ALL, COSTS, PROBES, SETTING, Choice, Run, label, setting, title
 from vd4rl_pomdp.report.render import Block, Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
@@ -88,7 +88,7 @@ SHOWN: dict[str, Columns] = {
     "claims": {
         "claim": claim_of,
         "setting": setting,
-        "verdict": lambda row: row["verdict"] or "–",
+        "verdict": lambda row: (row["verdict"] or "–") + "; opposite sign evaluated clean" * opposite(row),
         "left": lambda row: f"{row['left']}: {row['left_return']:.0f} (n = {row['left_seeds']})",
         "right": lambda row: f"{row['right']}: {row['right_return']:.0f} (n = {row['right_seeds']})",
         "difference": ("difference", "low", "high", 0),
