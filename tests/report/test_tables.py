@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers_report import write_run, write_seeds
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import tables
+from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.load import CONDITION, load_runs, runs_frame
 from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
@@ -66,6 +66,11 @@ def test_methods_with_missing_tasks_rank_last():
     found = tables.aggregate(lacking, NO_GAPS).to_dict("records")
     assert [(row["method"], row["tasks"], row["of_tasks"]) for row in found] == [("acro", 2, 2), ("mik", 1, 2)]
     assert found[1]["iqm"] > found[0]["iqm"]
+    looks = figures.looks_of(["acro", "mik"])
+    (plot,) = figures.profile_plots(tables.profiles(lacking), pd.DataFrame(found), looks)
+    (axes,) = plot.figure.axes
+    assert axes.get_legend_handles_labels()[1] == ["acro", "mik (1 of 2 tasks)"]
+    assert axes.lines[1].get_color() == figures.style(looks["mik"])["color"], "as in all figures"
 
 
 def test_profiles_are_shares_of_runs_above_threshold():

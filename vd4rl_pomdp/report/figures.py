@@ -282,6 +282,10 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
         axes.set_xlim(rows["threshold"].min(), rows["threshold"].max())
 
     shown = profiles.assign(label=profiles["method"])
+    for (name, tasks, all_tasks), part in profiles.groupby(["method", "tasks", "of_tasks"]):
+        if tasks < all_tasks:
+            marked = f"{name} ({tasks} of {all_tasks} tasks)"
+            shown.loc[part.index, "label"], looks = marked, looks | {marked: looks[str(name)]}
     caption = (
         "Performance profiles: share of the runs of all tasks and seeds whose final score is above a threshold, with "
         f"pointwise 95% bands. {seeds_note(aggregate['seeds'])}"

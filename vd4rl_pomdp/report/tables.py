@@ -170,9 +170,11 @@ def improvement(evaluated: pd.DataFrame) -> pd.DataFrame:
 def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
     """Fraction of runs (all tasks and seeds of a method) whose final score is above each threshold, with 95% bands.
 
-    Thresholds range from 0 (or the lowest score, if negative) to 100 (or 0, if no score is positive).
+    Thresholds range from 0 (or the lowest score, if negative) to 100 (or 0, if no score is positive). `of_tasks` is the
+    number of tasks and qualities under the corruption: methods with fewer `tasks` are not comparable to the others.
     """
     finals = final_scores(evaluated)
+    of_tasks = finals.drop_duplicates(list(SETTING)).groupby("corruption").size()
     top = 100 if (finals["score"] > 0).any() or not (finals["score"] < 0).any() else 0
     thresholds = np.linspace(min(0.0, finals["score"].min()), top, THRESHOLDS)
     parts = []
@@ -181,6 +183,7 @@ def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
         share, band = stats.performance_profile(strata, thresholds, np.random.default_rng(0), MANY)
         low, high = (np.nan, np.nan) if band is None else band
         names = {"corruption": corruption, "method": members["label"].iloc[0], "runs": len(members)}
+        names |= {"tasks": len(strata), "of_tasks": of_tasks[corruption]}
         parts.append(pd.DataFrame(names | {"threshold": thresholds, "share": share, "low": low, "high": high}))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
