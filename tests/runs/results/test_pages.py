@@ -1,5 +1,6 @@
 """Means with intervals or standard errors quoted in sentences on the pages match committed rows."""
 
+import functools
 import importlib
 import itertools
 import math
@@ -14,15 +15,19 @@ import pytest
 
 from vd4rl_pomdp.agents import SHIPPED, shipped
 from vd4rl_pomdp.report.gates import episodes_of
-from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.load import Run, load_runs
 from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
-from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.files import groups, read_json
 from vd4rl_pomdp.runs.results import read_certificates
 from vd4rl_pomdp.studies.navigation.report import write_report
 from vd4rl_pomdp.studies.navigation.runs import online_error, refitted_error
 
 ROOT = Path(__file__).parents[3]
 QUOTED = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?|[-+]?\d+(?: more| less| above it)? \[-?\d+, -?\d+\]")
+PAIR = re.compile(r"(`[^`]+`(?: with a GRU)?) minus (`[^`]+`(?: with a GRU)?)")
+"""The two methods of quoted differences, which follow in the sentence."""
+SENTENCE = re.compile(r"\.\s|\n\n")
+"""The end of a sentence."""
 GENERATED = re.compile(r"<!-- table: .* -->\n(?:\|.*\n)*")
 """Tables that scripts write; tests/tools/test_scripts.py compares them with the rows."""
 MAIN = ("control", "offline")
@@ -56,18 +61,34 @@ def with_differences(estimates: Iterable[Estimate | None], digits: int) -> Itera
         yield quoted((one[0] - other[0], math.hypot(one[1], other[1])), digits)
 
 
-def of_returns(folders: Iterable[str]) -> Iterator[str]:
+@functools.cache
+def on_sets(folders: tuple[str, ...]) -> list[list[list[Run]]]:
+    """Seeds of each method, corruption and variant on each set."""
+    runs = [run for run in load_runs([ROOT / "results" / name for name in folders]) if run.rows and run.finished]
+    by_set = groups(runs, lambda run: run.set_name).values()
+    names = ("corruption", "algorithm", "method", "variant")
+    return [list(groups(mine, lambda run: run.of(names)).values()) for mine in by_set]
+
+
+def of_returns(folders: tuple[str, ...]) -> Iterator[str]:
     """Quotable returns of methods on one set, under all corruptions and clean, and of single runs."""
-    groups = defaultdict(lambda: defaultdict(list))
-    for run in load_runs([ROOT / "results" / name for name in folders]):
-        if run.rows and run.finished:
-            kind = run.labels["corruption"], run.labels["algorithm"], run.method, run.variant
-            groups[run.set_name][kind].append(run)
-            yield quoted(estimate(row["return"] for row in run.last), 0)
-    for methods in groups.values():
-        everyone = list(methods.values())
+    for everyone in on_sets(folders):
+        yield from (quoted(estimate(row["return"] for row in run.last), 0) for mine in everyone for run in mine)
         yield from intervals([episodes_of(mine) for mine in everyone])
         yield from intervals([episodes_of(mine, True) for mine in everyone if all(run.last_clean for run in mine)])
+
+
+def of_pairs(folders: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
+    """Quotable differences on one set, each after the names of its two methods."""
+    for everyone in on_sets(folders):
+        for left, right in itertools.permutations(everyone, 2):
+            names = [
+                f"`{side[0].method}`" + " with a GRU" * ("history gru" in side[0].variant) for side in (left, right)
+            ]
+            for clean in [False, True][: 1 + all(run.last_clean for run in (*left, *right))]:
+                one, other = episodes_of(left, clean), episodes_of(right, clean)
+                ends = difference_interval(one, other) or (None, None)
+                yield names[0], names[1], with_interval(one.mean() - other.mean(), *ends, 0)
 
 
 def of_shifts() -> Iterator[str]:
@@ -108,13 +129,20 @@ def of_mazes(script: ModuleType) -> Iterator[str]:
             yield from with_differences(map(estimate, found), digits)
 
 
+PLACES = [MAIN, *((name,) for name in (*MAIN, *ASIDE))]
+
+
+@pytest.fixture(scope="module")
+def known_pairs() -> set[tuple[str, str, str]]:
+    return {found for folders in PLACES for found in of_pairs(folders)}
+
+
 @pytest.fixture(scope="module")
 def known() -> set[str]:
-    places = [MAIN, *((name,) for name in (*MAIN, *ASIDE))]
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "tools")
         script = importlib.import_module("navigation_table")
-    return {word for folders in places for word in of_returns(folders)} | {
+    return {word for folders in PLACES for word in of_returns(folders)} | {
         *of_shifts(),
         *of_agents(),
         *of_mazes(script),
@@ -123,9 +151,19 @@ def known() -> set[str]:
 
 def unknown(text: str, known: set[str]) -> list[str]:
     """Quoted numbers that no row supports; words may separate a difference from its interval."""
-    return [
-        found for found in QUOTED.findall(text) if re.sub(r" (more|less|above it)", "", found).lstrip("+") not in known
-    ]
+    return [found for found in QUOTED.findall(text) if number_in(found) not in known]
+
+
+def number_in(found: str) -> str:
+    return re.sub(r" (more|less|above it)", "", found).lstrip("+")
+
+
+def unknown_pairs(text: str, known: set[tuple[str, str, str]]) -> list[tuple[str, str, str]]:
+    """Quotes of "`X` minus `Y`", up to the next pair or the end of the sentence, that are not of X and Y."""
+    _, *parts = PAIR.split(text)  # left, right, the text that follows, left, ...
+    pairs = zip(parts[::3], parts[1::3], parts[2::3], strict=True)
+    quotes = [(*pair, number_in(found)) for *pair, rest in pairs for found in QUOTED.findall(SENTENCE.split(rest)[0])]
+    return [quote for quote in quotes if quote not in known]
 
 
 @pytest.mark.parametrize(
@@ -143,10 +181,18 @@ def unknown(text: str, known: set[str]) -> list[str]:
         ("results/navigation/README.md", 7),
     ],
 )
-def test_quoted_intervals_match_committed_rows(page, least, known):
+def test_quoted_intervals_match_committed_rows(page, least, known, known_pairs):
     text = GENERATED.sub("", (ROOT / page).read_text(encoding="utf-8"))
     assert len(QUOTED.findall(text)) >= least
     assert unknown(text, known) == []
+    assert unknown_pairs(text, known_pairs) == []
+
+
+def test_quotes_of_other_methods_are_found(known_pairs):
+    right = "`mik+a` minus `acro` is 108 [49, 167] (p = 0.008). 101 [29, 172]\n\n`mik` minus `acro`: 7 [-57, 71]"
+    assert unknown_pairs(right, known_pairs) == []
+    found = unknown_pairs("`mik` minus `acro`, 7 [-57, 71], and `mik` minus `mik+a`, 101 [29, 172]", known_pairs)
+    assert found == [("`mik`", "`mik+a`", "101 [29, 172]")]
 
 
 @pytest.mark.parametrize(
