@@ -85,7 +85,7 @@ def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: P
 def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
     """Append finished runs to a results folder: small files and raw evaluation rows, without weights and videos.
 
-    A run that is already there is not changed.
+    A run that is already there only gains rows of later evaluations.
 
     Args:
         runs: One or more run folders, results folders, or folders that contain some.
