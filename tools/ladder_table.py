@@ -209,20 +209,32 @@ def _spans(cell: Cell) -> str:
 
 
 def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
-    """Return of each run by rung, and the difference of `mik+a` and `acro`."""
+    """Return of each run by rung, and the differences of `mik+a` and `acro`, and of views; last, means over rungs."""
     rungs, rows = sorted({rung for cell in cells for rung in cell.returns}), []
     by_key = {cell.key: cell for cell in cells}
     for cell in cells:
-        rows.append((cell, cell.key.called, {rung: mean_and_error(_of(cell, rung)) for rung in cell.returns}))
-        other = by_key.get(cell.key._replace(method="mik+a"))
-        if cell.key.method == "acro" and other:
-            line = {}
-            for rung, one in cell.returns.items():  # with the standard error over the episodes' common starts
-                text = mean_and_error([value - one[seed] for seed, value in other.returns[rung].items()])
-                line[rung] = text if text.startswith("-") else f"+{text}"
-            rows.append((cell, f"`mik+a` minus {cell.key.called}", line))
-    table = ((cell.key.setting, called, *(line.get(rung, "") for rung in rungs)) for cell, called, line in rows)
-    return table_lines(("set", "return of", *(f"{rung:,}" for rung in rungs)), table, (0, 1))
+        means = [sum(one.values()) / len(one) for one in cell.returns.values()]
+        line = {rung: mean_and_error(_of(cell, rung)) for rung in cell.returns}
+        rows.append((cell, cell.key.called, line, f"{np.mean(means):.0f}" if means else ""))
+        pairs = [(cell, by_key.get(cell.key._replace(views=BASE[-1])))] if cell.key.views != BASE[-1] else []
+        pairs += [(by_key.get(cell.key._replace(method="mik+a")), cell)] if cell.key.method == "acro" else []
+        for one, other in pairs:
+            if one and other:  # with the standard error over the episodes' common starts
+                apart = {
+                    rung: [value - other.returns[rung][seed] for seed, value in mine.items()]
+                    for rung, mine in one.returns.items()
+                }
+                line = {rung: _signed(mean_and_error(values)) for rung, values in apart.items()}
+                mean = np.mean([np.mean(values) for values in apart.values()])
+                rows.append((cell, f"{one.key.called} minus {other.key.called}", line, _signed(f"{mean:.0f}")))
+    table = (
+        (cell.key.setting, called, *(line.get(rung, "") for rung in rungs), mean) for cell, called, line, mean in rows
+    )
+    return table_lines(("set", "return of", *(f"{rung:,}" for rung in rungs), "mean"), table, (0, 1))
+
+
+def _signed(text: str) -> str:
+    return text if text.startswith("-") else f"+{text}"
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:

@@ -57,7 +57,11 @@ def pages() -> dict[str, Tables]:
             "contrasts": offline.contrast_lines(returns),
             "aggregate": offline.aggregate_lines(returns),
         },
-        "protocol": {"methods": protocol.method_lines(frozen), "contrasts": protocol.contrast_lines(frozen)},
+        "protocol": {
+            "methods": protocol.method_lines(frozen),
+            "contrasts": protocol.contrast_lines(frozen),
+            "paired": protocol.paired_lines(frozen),
+        },
     }
     return {f"results/{place}/README.md": of_page for place, of_page in tables.items()}
 

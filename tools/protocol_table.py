@@ -30,13 +30,44 @@ def method_lines(runs: Sequence[Run]) -> Iterator[str]:
     for place, here in groups(runs, lambda run: run.of(("task", "quality", "corruption"))).items():
         by_method = groups(here, lambda run: label(run.named))
         for name, mine in sorted(by_method.items(), key=lambda item: -episodes_of(item[1]).mean()):
-            clean = number(None) if place[2] == CLEAN else mean_text(episodes_of(mine, clean=True))
+            clean = number(None) if place[2] == CLEAN else _of_seeds(episodes_of(mine, clean=True))
             probes = ", ".join(f"{np.mean([run.measures[probe] for run in mine]):.0f}" for probe in PROBES)
             moved = 100 * np.max(np.abs(np.array([run.measures["critic_moved"] for run in mine], dtype=float)))
-            cells = mean_text(episodes_of(mine)), clean, probes, f"{moved:.2f}%"
+            cells = _of_seeds(episodes_of(mine)), clean, probes, f"{moved:.2f}%"
             rows.append((", ".join(place), f"`{name}`", len(mine), *cells))
     head = ("setting", "method", "n", "return", "evaluated clean", "probe: pose, velocity", "critic moved at most")
     return table_lines(head, rows, (0, 1))
+
+
+def _of_seeds(returns: np.ndarray) -> str:
+    """Mean and interval of (seeds, episodes) returns; of two seeds, whose interval says little, both means."""
+    if len(returns) != 2:
+        return mean_text(returns)
+    return f"{returns.mean():.0f} ({', '.join(f'{seed:.0f}' for seed in returns.mean(1))})"
+
+
+GRU = "acro, history gru"
+PAIRS = (("mik", "acro"), (GRU, "acro"), ("mik+a", "mik"), ("mik+a", "acro"), ("mik+a", GRU))
+
+
+def paired_lines(runs: Sequence[Run]) -> Iterator[str]:
+    """Differences paired by training seed, since methods share its dataset; where three seeds were evaluated clean."""
+    rows = []
+    for place, here in groups(runs, lambda run: run.of(("task", "quality", "corruption"))).items():
+        by_method = groups((run for run in here if run.last_clean), lambda run: label(run.named))
+        by_seed = {name: {run.labels["seed"]: run for run in mine} for name, mine in by_method.items()}
+        for names in PAIRS:
+            left, right = (by_seed.get(name, {}) for name in names)
+            if len(seeds := sorted(left.keys() & right.keys())) >= 3:
+                trained, clean = (
+                    episodes_of([left[seed] for seed in seeds], kind)
+                    - episodes_of([right[seed] for seed in seeds], kind)
+                    for kind in (False, True)
+                )
+                change = trained.mean(1, keepdims=True) - clean.mean(1, keepdims=True)
+                cells = mean_text(trained), mean_text(clean), mean_text(change)
+                rows.append((", ".join(place), f"`{names[0]}` minus `{names[1]}`", len(seeds), *cells))
+    return table_lines(("setting", "contrast", "n", "as trained", "clean", "as trained minus clean"), rows, (0, 1))
 
 
 SECOND_BUDGETS = ("finetune.updates=120000", "finetune.updates=160000")
