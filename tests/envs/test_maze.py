@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.envs.maze import MazeEnv, build_simulator
+from vd4rl_pomdp.envs.maze import MazeEnv, build_simulator, replay_states
 from vd4rl_pomdp.envs.maze_renderers import panorama, sky_texture
 from vd4rl_pomdp.envs.mazes import HARD, MAZES, PAPER_MAZES
 
@@ -265,3 +265,24 @@ def test_unreached_goals_expire():
 def test_invalid_maze_arguments_are_rejected(arguments, message):
     with pytest.raises(UserError, match=message):
         MazeEnv("no_curtain", **arguments)
+
+
+def test_first_person_starts_face_all_directions():
+    env = MazeEnv("first_person", pixels=False)
+    headings = np.array([env.reset(seed=seed)[1]["state"][2] for seed in range(60)])
+    assert (headings.min(), headings.max()) == (pytest.approx(-np.pi, abs=0.5), pytest.approx(np.pi, abs=0.5))
+
+
+def test_replay_repeats_actions_as_the_environment():
+    env, actions = MazeEnv("no_curtain", 2, pixels=False), np.random.default_rng(0).uniform(-1, 1, (4, 2))
+    start = env.reset(seed=0)[1]["state"]
+    states = [env.step(action)[-1]["state"] for action in actions]
+    np.testing.assert_allclose(replay_states("no_curtain", start, actions, 2), states)
+
+
+@pytest.mark.parametrize("kind", ["fast", "exact"])
+def test_requested_renderer_draws(kind, monkeypatch):
+    made = []
+    monkeypatch.setattr("vd4rl_pomdp.envs.maze.make_renderer", lambda *given: made.append(given[2]) or (lambda _: None))
+    MazeEnv("no_curtain", render=kind).draw()
+    assert made == [kind]
