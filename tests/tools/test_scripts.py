@@ -53,3 +53,16 @@ def test_tables_are_replaced_under_their_marks(monkeypatch):
         UserError, match=r"^page.md: expected one line `<!-- table: new -->` above that table, found 0$"
     ):
         script.with_tables(page, {"new": ["| 3 |"]}, "page.md")
+
+
+def test_papers_figure_has_a_panel_per_set_and_shows_what_was_not_run(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script, offline = importlib.import_module("paper_figures"), importlib.import_module("offline_table")
+    (drawn,) = script.figures(offline.runs_of([str(offline.RESULTS / "protocol.toml")], ["protocol"])).values()
+    panels = {axes.get_title(): axes for axes in drawn.axes}
+    assert len(panels) == len(script.TASKS_SHOWN) * len(script.QUALITIES)
+    assert [text.get_text() for text in panels["humanoid_walk expert"].texts] == ["not run"] * len(script.METHODS)
+    shown = [text.get_text() for text in panels["walker_walk medium_expert"].texts]
+    assert shown[:2] == ["n = 5", "n = 5"], "mik+a and mik"
+    bar = panels["walker_walk medium_expert"].patches[0]
+    assert bar.get_width() == pytest.approx(34.6, abs=0.05), "as in the page's table"
