@@ -174,6 +174,11 @@ def test_negative_rows_and_counts_below_one_are_rejected(dataset):
         View(dataset).stacks(torch.tensor([0, -1]))
     with pytest.raises(UserError, match="--n-step is 0"):
         View(dataset).transitions(0, n_step=0)
+    for gamma in (99, float("nan")):
+        with pytest.raises(UserError, match=f"--gamma is {gamma}"):
+            View(dataset).transitions(0, gamma=gamma)
+        with pytest.raises(UserError, match=f"--gamma is {gamma}"):
+            TransitionSampler(dataset, 1, torch.Generator(), gamma=gamma)
     with pytest.raises(UserError, match="--frame-stack is 0"):
         View(dataset, frame_stack=0)
     with pytest.raises(UserError, match="--shift is -4"):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.core.streams import RandomStream, stream_seed
@@ -97,3 +98,27 @@ def test_empty_batches_have_shapes(dataset, shift):
     view = View(dataset, CorruptionConfig.of("patch+zero_frames"), shift)
     assert view.transitions([]).obs.shape == (0, 9, 84, 84)
     assert view.windows([], 3).obs.shape == (0, 3, 9, 84, 84)
+
+
+@pytest.mark.parametrize("shift", [0, 4])
+def test_rows_need_not_be_contiguous(dataset, shift):
+    rows = torch.arange(6).view(2, 3).T
+    for corruption in ("none", "patch+zero_frames"):
+        seen = [View(dataset, corruption, shift).observe(given).clone() for given in (rows, rows.contiguous())]
+        assert torch.equal(*seen)
+
+
+@pytest.mark.parametrize(("mode", "shift", "different"), [("resample", 0, 8), ("resample", 4, 8), ("emission", 0, 1)])
+def test_workers_and_epochs_draw_different_keys_except_for_emissions(dataset, mode, shift, different):
+    view = View(dataset, CorruptionConfig.of("patch", corruption_mode=mode), shift)
+
+    class Items(torch.utils.data.Dataset):
+        def __len__(self) -> int:
+            return 4
+
+        def __getitem__(self, number: int) -> torch.Tensor:
+            return view.observe(torch.tensor([2]))
+
+    loader = DataLoader(Items(), num_workers=2, generator=torch.Generator().manual_seed(0))
+    seen = [item.numpy().tobytes() for _ in range(2) for item in loader]
+    assert (len(seen), len(set(seen))) == (8, different)

@@ -11,8 +11,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.data import get_worker_info
 
 from vd4rl_pomdp.core import hardware
+from vd4rl_pomdp.core.streams import stream_seed
 
 # SplitMix64's constants as int64: products overflow and wrap around like uint64's.
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
@@ -84,9 +86,11 @@ class KeyStream:
         """0-d int64 tensor on the device of the keys, not a Python int, which a CUDA graph would freeze."""
 
     def take(self, shape: tuple[int, ...] | torch.Size, device: torch.device | str = "cpu") -> Tensor:
-        """Next keys of the stream, int64 of shape `shape`."""
+        """Next keys of the stream, int64 of shape `shape`; workers of a DataLoader draw others, new in every epoch."""
+        worker = get_worker_info()  # each worker starts from a copy of the position
+        seed = self.seed if worker is None else stream_seed(self.seed, "worker", worker.seed)
         self.position = self.position.to(device)
-        return next_keys(self.seed, self.position, tuple(shape))
+        return next_keys(seed, self.position, tuple(shape))
 
     def go_to(self, position: int) -> None:
         self.position.fill_(position)

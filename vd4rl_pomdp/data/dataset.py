@@ -194,6 +194,7 @@ class Dataset:
         successor, the result is 0, 1 and the row itself.
         """
         refuse_number("n_step", n_step, 1)
+        refuse_number("gamma", gamma, 0, 1)
         # Row t + 1 stores the reward of step t: sum rows t + 1 .. t + m, up to the episode's last row.
         last = (self.episode_end - 1)[self.episode[rows]]
         step = torch.arange(n_step, device=rows.device)

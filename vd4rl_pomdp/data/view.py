@@ -63,7 +63,7 @@ class View:
         if augmentation.by_lines(frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
         if not hardware.in_host_memory(frames):
-            index = self.dataset.stack_rows(rows, self._frame_stack).view(-1, self._frame_stack)
+            index = self.dataset.stack_rows(rows, self._frame_stack).reshape(-1, self._frame_stack)
             obs = self.corruption.corruption.paint(frames, index, keys.flatten(), shift_key, self._pad)
             if obs is not None:
                 return obs.view(*rows.shape, *obs.shape[1:])
@@ -148,7 +148,7 @@ class View:
         corruption, frames, stack = self.corruption.corruption, self.dataset.frames, self._frame_stack
         keys = keys.flatten()
         kept = corruption.kept(keys, stack)
-        chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
+        chosen = self.dataset.stack_rows(rows, stack).reshape(-1, stack).gather(1, kept)
         # One more image than chosen: the zero frame.
         images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
         # Frames with the same shift key are consecutive.
@@ -246,6 +246,7 @@ class TransitionSampler(Sampler):
     ) -> None:
         super().__init__(source, batch_size, draws)
         refuse_number("n_step", n_step, 1)
+        refuse_number("gamma", gamma, 0, 1)
         self.view.dataset.require_transitions()
         self._n_step, self._gamma = n_step, gamma
 
