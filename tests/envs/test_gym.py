@@ -141,3 +141,23 @@ def test_corruption_options_are_arguments():
 def test_invalid_arguments_are_rejected(arguments, message):
     with pytest.raises(UserError, match=message):
         make("WalkerWalk", **arguments)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("WalkerWalk", {}),
+        ("WalkerWalk", {"render": "exact"}),
+        ("MazeNoCurtain", {}),
+        ("MazeNoCurtain", {"render": "exact"}),
+        ("ForwardJumpCounterexample", {}),
+    ],
+)
+def test_closed_environments_can_be_reset(name, arguments):
+    closed, fresh = (make(name, **arguments).unwrapped for _ in range(2))
+    closed.reset(seed=0)
+    closed.close()
+    closed.close()
+    np.testing.assert_array_equal(closed.reset(seed=3)[0], fresh.reset(seed=3)[0])
+    action = fresh.action_space.sample()
+    np.testing.assert_array_equal(closed.step(action)[0], fresh.step(action)[0])

@@ -1,3 +1,5 @@
+import copy
+import pickle
 import tempfile
 
 import gymnasium
@@ -286,3 +288,13 @@ def test_requested_renderer_draws(kind, monkeypatch):
     monkeypatch.setattr("vd4rl_pomdp.envs.maze.make_renderer", lambda *given: made.append(given[2]) or (lambda _: None))
     MazeEnv("no_curtain", render=kind).draw()
     assert made == [kind]
+
+
+@pytest.mark.parametrize("render", ["fast", "exact"])
+def test_mazes_can_be_copied_after_rendering(render):
+    env = MazeEnv("one_curtain", render=render)
+    env.reset(seed=0)
+    copies = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    observation = env.step(np.ones(2))[0]
+    for copied in copies:
+        np.testing.assert_array_equal(copied.step(np.ones(2))[0], observation)

@@ -67,7 +67,8 @@ class DMCEnv(PixelEnv):
         return 1 / (self.simulator.control_timestep() * self.task.action_repeat)
 
     def close(self) -> None:
-        self.physics.free()
+        if self.size is not None:
+            self._frame_camera.close()
 
     def _begin(self, seed: int) -> None:
         self._random.seed(seed)

@@ -136,6 +136,10 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         if isinstance(self._renderer, ExactRenderer):
             self._renderer.close()
+            self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_renderer": None}  # an OpenGL context cannot be copied; the copy makes its own
 
     def is_free(self, place: np.ndarray, room: float = 0.0) -> bool:
         """Whether the mass, enlarged by `room`, fits at position `place` (2,) without touching a wall."""

@@ -129,7 +129,7 @@ class PixelEnv(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free the simulator and its renderer."""
+        """Free what the renderer holds; dm_control's tasks can be reset again."""
 
     @abstractmethod
     def _begin(self, seed: int) -> None:

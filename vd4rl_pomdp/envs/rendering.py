@@ -128,6 +128,12 @@ class FrameCamera:
             image = self._camera.render()
         return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera reuses its buffer
 
+    def close(self) -> None:
+        """Free the OpenGL context; the next frame creates another."""
+        self._camera = None
+        if self._physics._contexts:  # `physics.free` would free the simulator, too
+            self._physics._free_rendering_contexts()
+
 
 @cache
 def _sky() -> np.ndarray:
