@@ -45,6 +45,24 @@ def test_observations_of_another_shape_are_rejected():
             encoder.step(obs[:, 0], other.prev_action[:, 0], encoder.initial_state(len(obs)))
 
 
+@pytest.mark.parametrize("history", ["none", "gru"])
+def test_missing_and_extra_dimensions_are_rejected(history):
+    encoder, whole = make(history, False), window()
+    row, action, state = whole.obs[:, 0], whole.prev_action[:, 0], encoder.initial_state(2)
+    for obs, given in ((row[0], action[0]), (row[None], action[None])):
+        with pytest.raises(UserError, match=r"of shape \(B, 9, 84, 84\) here, not \(.*: add or remove"):
+            encoder.step(obs, given, state)
+    with pytest.raises(UserError, match=r"of shape \(B, T, 9, 84, 84\) here, not \(9, 9, 84, 84\)"):
+        encoder.encode(whole.replace(obs=whole.obs[0], prev_action=whole.prev_action[0]))
+
+
+@pytest.mark.parametrize("history", ["none", "gru", "lru"])  # attention cannot reshape zero windows
+def test_empty_batches_have_shapes(history):
+    encoder, whole = make(history, True), window()
+    none = whole.replace(**{name: whole[name][:0] for name in whole})
+    assert encoder.encode(none).shape == (0, 9, encoder.dim)
+
+
 @pytest.mark.parametrize("span", [None, 1, 2, 5, 99])
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("number", [1, 3])

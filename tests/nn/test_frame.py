@@ -10,6 +10,9 @@ def test_state_of_another_width_is_rejected():
     assert frame(torch.zeros(2, 17, 1, 1)).shape == (2, 17)
     with pytest.raises(UserError, match="reads states of 17 coordinates, the task's have 18: pretrain the reference"):
         frame(torch.zeros(2, 18, 1, 1))
+    for channels in (9, 17):
+        with pytest.raises(UserError, match=r"reads simulator states \(..., 17, 1, 1\), not images \(2, \d+, 84, 84\)"):
+            frame(torch.zeros(2, channels, 84, 84))
 
 
 @pytest.mark.parametrize("size", [84, 83])

@@ -171,7 +171,7 @@ class Encoder(nn.Module):
 
     def encode(self, window: Windows) -> Tensor:
         """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); UserError for another image shape."""
-        self._refuse_other(window.obs)
+        self._refuse_other(window.obs, "B", "T")
         whole = self.config.readout == "state" and not self.config.history_window
         if self.memory is not None and self.memory.first_only and whole:
             # only the first row's features are read: skip the frame encoder, most of a step's cost, on the others
@@ -205,7 +205,7 @@ class Encoder(nn.Module):
 
         `prev_action` is zero at an episode's first row.
         """
-        self._refuse_other(obs)
+        self._refuse_other(obs, "B")
         features = self.frame(obs)
         if not self.remembers:
             return features, state
@@ -220,9 +220,15 @@ class Encoder(nn.Module):
         newest = run_memory(self.memory, self._forget_first_action(rows))[0][:, -1]
         return self._read(features, newest), state._replace(rows=rows)
 
-    def _refuse_other(self, obs: Tensor) -> None:
-        """Raise UserError for observations (..., C, H, W) of another shape than this encoder's."""
-        own = (self.config.channels, self.config.size, self.config.size)
+    def _refuse_other(self, obs: Tensor, *leading: str) -> None:
+        """Raise UserError for observations (`leading`, C, H, W) of another shape than this encoder's."""
+        size = 1 if self.reads_state else self.config.size
+        own = (self.config.channels, size, size)
+        if obs.dim() != len(leading) + 3:
+            raise UserError(
+                f"this encoder reads observations of shape ({', '.join([*leading, *map(str, own)])}) here, not "
+                f"{tuple(obs.shape)}: add or remove leading dimensions"
+            )
         if not self.reads_state and obs.shape[-3:] != own:
             raise UserError(
                 f"this encoder reads observations of shape {own}, not {tuple(obs.shape[-3:])}: use frames "

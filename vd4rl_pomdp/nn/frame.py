@@ -72,7 +72,8 @@ class FrameEncoder(nn.Module):
     def from_maps(self, maps: Tensor) -> Tensor:
         """Features (..., feature_dim) float32 of feature maps."""
         dtype = next(self.project.parameters()).dtype
-        return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
+        features = self.project(maps.flatten(-3).flatten(0, -2)).to(dtype)
+        return features.view(*maps.shape[:-3], features.shape[-1])
 
     def _precision(self, obs: Tensor) -> torch.dtype:
         if torch.is_autocast_enabled(obs.device.type):
@@ -241,7 +242,12 @@ class StateFrame(nn.Module):
         """Optimisers need at least one parameter, and weight files one tensor."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """The state itself; UserError if it has another width, as in earlier versions."""
+        """The state itself; UserError for images, or if it has another width, as in earlier versions."""
+        if obs.shape[-2:] != (1, 1):
+            raise UserError(
+                f"this encoder reads simulator states (..., {self.width}, 1, 1), not images {tuple(obs.shape)}: give "
+                "it the dataset's or the environment's states"
+            )
         if obs.shape[-3] != self.width:
             raise UserError(
                 f"this encoder reads states of {self.width} coordinates, the task's have {obs.shape[-3]}: "
