@@ -99,7 +99,8 @@ def play(
     under = cards[0]["corruption"]["corruption"]
     print(f"{episodes} episodes of {cards[0]['task']} under {under}: mean return [95% t interval over episodes]")
     returns = [np.array([episode.total for episode in one])[:, None] for one in played]
-    names = [f"{card['method']}, seed {card['seed']}" for card in cards]
+    about = [f"{card['method']}, seed {card['seed']}" for card in cards]
+    names = [name if about.count(name) == 1 else given for name, given in zip(about, agents, strict=True)]
     lines = list(zip(names, returns, strict=True))
     lines += [(f"{names[0]} less {name}", returns[0] - others) for name, others in lines[1:]]
     for name, values in lines:
