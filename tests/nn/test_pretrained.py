@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -172,3 +173,13 @@ def test_missing_weights_and_other_channels_are_reported(model: Path):
 
     with pytest.raises(UserError, match="needs frames of 3 channels, not 4"):
         Pretrained(str(model), SIZE, "", 4)
+
+
+def test_moved_model_of_a_saved_encoder_is_reported(monkeypatch):
+    fake = MagicMock()
+    fake.AutoModel.from_pretrained.side_effect = OSError("models/tiny is no folder")
+    monkeypatch.setitem(sys.modules, "transformers", fake)
+    with pytest.raises(
+        UserError, match=r"models/tiny: cannot be .* put the model at that path, or change frame_options"
+    ):
+        make("pretrained", model="models/tiny")

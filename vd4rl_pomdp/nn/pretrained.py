@@ -109,7 +109,8 @@ def _load(name: str) -> Any:
     except (OSError, ValueError) as error:
         raise UserError(
             f"--model {name}: cannot be loaded from this machine ({first_line(error)}): run `hf download {name}` once "
-            "where there is a network, or name a folder that transformers' save_pretrained wrote"
+            "where there is a network, or name a folder that transformers' save_pretrained wrote (for a saved encoder: "
+            "put the model at that path, or change frame_options.model in the encoder's config.json)"
         ) from error
     missing = report["missing_keys"]
     if pooler := {key for key in missing if "pooler." in key}:
