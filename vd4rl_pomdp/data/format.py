@@ -165,8 +165,8 @@ def _open(path: Path) -> Iterator[h5py.File]:
         if "unable to lock file" in str(error) or "already open for write" in str(error):
             raise UnavailableError(
                 f"{path}: another program is writing it or was killed while writing, or its disk does not support "
-                "locks; close that program and re-run the same command, clear the file's flag with `h5clear -s`, or "
-                "set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
+                "locks; close that program and re-run the same command, clear the file's flag with `h5clear -s` "
+                "(Debian: hdf5-tools), or set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
             ) from error
         damaged = UserError(f"{path}: is truncated, damaged or not an HDF5 file ({in_one_line(error)}); {_REPAIR}")
         raise system_error(path, error) or damaged from error
