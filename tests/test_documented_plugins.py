@@ -168,6 +168,8 @@ def test_options_without_a_default_or_with_wrong_limits_are_refused(registries):
         options = type("Mine", (option_called("depth"),), {"limits": limits})
         with pytest.raises(UserError, match=message):
             registries["method"].register("mine", part_with("method", options))
+    required = type("Mine", (option_called("depth"),), {"check": lambda self: 1 / 0})
+    registries["method"].register("required", part_with("method", required))  # its own check is for its users
     with pytest.raises(UserError, match="its option 'depth' has no default"):
         registries["method"].register("mine", part_with("method", Unset))
 

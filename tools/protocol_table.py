@@ -52,9 +52,14 @@ PAIRS = (("mik", "acro"), (GRU, "acro"), ("mik+a", "mik"), ("mik+a", "acro"), ("
 
 def paired_lines(runs: Sequence[Run]) -> Iterator[str]:
     """Differences paired by training seed, since methods share its dataset; where three seeds were evaluated clean."""
+
+    def called(run: Run) -> str:
+        return GRU if run.method == "acro" and run.settings["history"] == "gru" else run.method
+
     rows = []
-    for place, here in groups(runs, lambda run: run.of(("task", "quality", "corruption"))).items():
-        by_method = groups((run for run in here if run.last_clean), lambda run: label(run.named))
+    by_place = groups(runs, lambda run: (*run.of(("task", "quality", "corruption")), run.settings["updates"]))
+    for (*place, updates), here in by_place.items():
+        by_method = groups((run for run in here if run.last_clean), called)
         by_seed = {name: {run.labels["seed"]: run for run in mine} for name, mine in by_method.items()}
         for names in PAIRS:
             left, right = (by_seed.get(name, {}) for name in names)
@@ -66,7 +71,8 @@ def paired_lines(runs: Sequence[Run]) -> Iterator[str]:
                 )
                 change = trained.mean(1, keepdims=True) - clean.mean(1, keepdims=True)
                 cells = mean_text(trained), mean_text(clean), mean_text(change)
-                rows.append((", ".join(place), f"`{names[0]}` minus `{names[1]}`", len(seeds), *cells))
+                words = f"{', '.join(place)}, {int(updates):,} updates"
+                rows.append((words, f"`{names[0]}` minus `{names[1]}`", len(seeds), *cells))
     return table_lines(("setting", "contrast", "n", "as trained", "clean", "as trained minus clean"), rows, (0, 1))
 
 

@@ -146,7 +146,7 @@ def test_help_imports_no_torch_and_survives_a_closed_pipe():
 
 @pytest.mark.parametrize(("words", "to", "code"), [
     ("data check nowhere", "2>/dev/full", 2), ("data check nowhere", ">/dev/full 2>&1", 2),
-    ("sweep list", ">/dev/full 2>&1", TEMPORARY),
+    ("sweep list", ">/dev/full 2>&1", TEMPORARY), ("sweep list", ">&-", 0),
 ])  # fmt: skip
 def test_full_disk_under_the_log_keeps_the_exit_code(words, to, code):
     command = f"{sys.executable} -m vd4rl_pomdp {words} {to}"

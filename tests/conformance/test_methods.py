@@ -117,6 +117,14 @@ class Listed(Mean):
         self.heads = [nn.Linear(2, 2)]
 
 
+class Teacher(Mean):
+    """Keeps a frozen network to itself."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.teacher = [nn.Linear(2, 2).requires_grad_(False)]
+
+
 class Named(Mean):
     def loss(self, window, progress):
         loss, logs = super().loss(window, progress)
@@ -224,6 +232,8 @@ def test_check_method_accepts_conforming_methods():
     check_method("mine", feature_dim=5)
     with pytest.raises(UserError, match="--max-k is not read by the method mine"):
         check_method("mine", max_k=2)
+    METHODS.register("teacher", Method(Teacher))
+    check_method("teacher")
     METHODS.register("named", Method(Named))
     with pytest.raises(UserError, match=r"a scalar of the loss is called 'eval/x', .*: rename it"):
         check_method("named")

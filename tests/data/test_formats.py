@@ -499,6 +499,9 @@ def test_interrupted_import_resumes_to_identical_files(tmp_path, monkeypatch, sh
     shards = import_set("vd4rl", str(folder), tmp_path / "set", shortest=shortest)
     assert written[0].stat().st_mtime_ns == changed
     assert [shard.read_bytes() for shard in shards] == [shard.read_bytes() for shard in whole]
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 10)  # as if by another version
+    with pytest.raises(UserError, match="differs in episodes_per_shard"):
+        import_set("vd4rl", str(folder), tmp_path / "set", shortest=shortest)
 
 
 def test_shards_of_large_frames_have_fewer_rows(tmp_path, monkeypatch):

@@ -47,6 +47,13 @@ def test_reference_actor_is_known_only_if_single_and_shipped(tmp_path, shards, k
     assert reference.mean_reward == pytest.approx(float(dataset.reward[dataset.t > 0].mean()), abs=1e-5)
 
 
+def test_single_rows_are_no_episodes_of_the_data_return(tmp_path):
+    rows = fake_rows([1, 5, 1, 6])
+    write_rows(tmp_path / "set", rows, {}, "0_fake.hdf5")
+    returns = open_dataset(tmp_path / "set").returns
+    assert Reference.of(open_dataset(tmp_path / "set")).data_return == pytest.approx(float(returns[[1, 3]].mean()))
+
+
 def test_reference_round_trip_and_retired_actor(tmp_path):
     assert Reference.read(tmp_path) == Reference(), "early versions stored no file, and then no mean reward"
     (tmp_path / REFERENCE_FILE).write_text('{"data_return": 2.0, "actor": null, "path_error": null}')

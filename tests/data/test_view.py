@@ -108,17 +108,29 @@ def test_rows_need_not_be_contiguous(dataset, shift):
         assert torch.equal(*seen)
 
 
+class Items(torch.utils.data.Dataset):
+    """The same observation, four times."""
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, number: int) -> torch.Tensor:
+        return self.view.observe(torch.tensor([2]))
+
+
 @pytest.mark.parametrize(("mode", "shift", "different"), [("resample", 0, 8), ("resample", 4, 8), ("emission", 0, 1)])
 def test_workers_and_epochs_draw_different_keys_except_for_emissions(dataset, mode, shift, different):
     view = View(dataset, CorruptionConfig.of("patch", corruption_mode=mode), shift)
-
-    class Items(torch.utils.data.Dataset):
-        def __len__(self) -> int:
-            return 4
-
-        def __getitem__(self, number: int) -> torch.Tensor:
-            return view.observe(torch.tensor([2]))
-
-    loader = DataLoader(Items(), num_workers=2, generator=torch.Generator().manual_seed(0))
+    loader = DataLoader(Items(view), num_workers=2, generator=torch.Generator().manual_seed(0))
     seen = [item.numpy().tobytes() for _ in range(2) for item in loader]
     assert (len(seen), len(set(seen))) == (8, different)
+
+
+def test_spawned_workers_do_not_advance_the_view(dataset):
+    view = View(dataset, "patch")
+    loader = DataLoader(Items(view), num_workers=1, multiprocessing_context="spawn")
+    assert len({item.numpy().tobytes() for item in loader}) == 4
+    assert view.state_dict() == {"corruption": 0, "shift": 0}

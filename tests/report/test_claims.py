@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 from tests.helpers_report import describe, on_own_sets, write_run, write_seeds
-from vd4rl_pomdp.report.gates import CLAIMS, judge_claims, tally
+from vd4rl_pomdp.report.gates import CLAIMS, GATED, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.page import print_summary, write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
@@ -129,7 +129,8 @@ def test_holm_correction_applies_within_claim_families(tmp_path):
     assert [row for row in with_another if row["algorithm"] == "td3_bc"] == [*rows.values()], "each setting by itself"
 
 
-def test_every_budget_has_its_own_verdicts(tmp_path):
+@pytest.mark.parametrize(("setting", "usual", "other"), [("updates", 10, 20), ("batch_size", None, 7)])
+def test_every_budget_has_its_own_verdicts(tmp_path, setting, usual, other):
     """Even if returns differ: choosing the budget by returns would bias the contrast."""
     scores = {("acro", "patch"): (20, 22, 21), ("mik", "patch"): (31, 36, 32), ("mik+a", "patch"): (33, 41, 38)}
     twice = {("acro", "patch"): (45, 47, 46), ("mik", "patch"): (30, 60, 40), ("mik+a", "patch"): (60, 64, 63)}
@@ -137,11 +138,12 @@ def test_every_budget_has_its_own_verdicts(tmp_path):
     write(tmp_path / "two", twice)
     for run in (tmp_path / "two").iterdir():
         record = read_json(run / "config.json")
-        write_json(run / "config.json", record | {"config": record["config"] | {"updates": 20}})
+        usual = usual or record["config"][setting]
+        write_json(run / "config.json", record | {"config": record["config"] | {setting: other}})
     both = judge_claims(load_runs([tmp_path]))
-    for folder, updates in (("one", 10), ("two", 20)):
+    for folder, value in (("one", usual), ("two", other)):
         alone = judge_claims(load_runs([tmp_path / folder]))
-        mine = [row for row in both if f"updates {updates}" in row["left"] and row["family"] == "primary"]
+        mine = [row for row in both if f"{setting} {value}" in row["left"] and row["family"] == "primary"]
         assert len(mine) == 3
         for row, expected in zip(mine, (row for row in alone if row["family"] == "primary"), strict=True):
             for name in ("claim", "left_return", "right_return", "p", "adjusted_p", "verdict"):
@@ -169,6 +171,9 @@ def test_protocol_table_has_a_row_per_budget(tmp_path, monkeypatch):
     assert "| `mik, updates 20` minus `acro, updates 20` | 4, 4 | 2 [" in two
     assert "| undecided; opposite sign evaluated clean; depends on the budget |" in two
     assert re.search(r"\| \d+ \(\d+%\) \|", one)
+    *_, one, two = importlib.import_module("protocol_table").paired_lines(load_runs([tmp_path]))
+    assert "| walker_walk, expert, patch, 10 updates | `mik` minus `acro` | 4 | 102 [" in one
+    assert ", 20 updates | `mik` minus `acro` | 4 | 2 [" in two
 
 
 def test_seeds_with_individual_sets_are_compared(tmp_path):
@@ -285,5 +290,6 @@ def test_page_and_terminal_show_claims(tmp_path, capsys):
 
 def test_tally_counts_unjudged_settings_by_reason():
     verdicts = ["not judged: other data", "undecided", "holds", "not judged: other data", "not judged: other readout"]
-    rows = [{"kind": "above", "verdict": verdict} for verdict in verdicts]
+    rows = [{"kind": "above", "verdict": verdict} | dict.fromkeys(GATED, str(n)) for n, verdict in enumerate(verdicts)]
     assert tally(rows) == "holds in 1 of 5 settings; undecided in 1; not judged in 3 (2 other data, 1 other readout)"
+    assert tally([rows[1], rows[2] | dict.fromkeys(GATED, "1")]) == "holds in 1 of 2 comparisons; undecided in 1"

@@ -100,7 +100,8 @@ def run_to_end(words: Sequence[str]) -> End:
             finally:
                 failure = sys.exception()
                 try:
-                    sys.stdout.flush()  # here, where a closed pipe is handled; --help ends in SystemExit
+                    if sys.stdout is not None:  # it may have been closed
+                        sys.stdout.flush()  # here, where a closed pipe is handled; --help ends in SystemExit
                 except OSError as error:
                     _discard(sys.stdout)
                     if failure is None or isinstance(error, BrokenPipeError):  # else a full disk is no news

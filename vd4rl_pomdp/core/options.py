@@ -193,7 +193,7 @@ def refuse_options(kind: Any, base: type[Options] = Options) -> None:
     for name in (name for one in kind.__mro__ for name in vars(one).get("limits", {}) if name not in own):
         raise UserError(f"its limits name {name!r}, which is none of its options: correct the name")
     usual = kind.fill({})
-    usual.check()
+    Options.check(usual)  # ranges only: a part's own check may require an option
     for name, value in flat(usual).items():
         # records would leave it out, so that runs or encoders with other values would count as the same
         if name in NO_SETTINGS or name in LABELS or LATER.get(name, value) != value:

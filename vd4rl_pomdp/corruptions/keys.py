@@ -87,9 +87,9 @@ class KeyStream:
 
     def take(self, shape: tuple[int, ...] | torch.Size, device: torch.device | str = "cpu") -> Tensor:
         """Next keys of the stream, int64 of shape `shape`; workers of a DataLoader draw others, new in every epoch."""
-        worker = get_worker_info()  # each worker starts from a copy of the position
+        worker = get_worker_info()
         seed = self.seed if worker is None else stream_seed(self.seed, "worker", worker.seed)
-        self.position = self.position.to(device)
+        self.position = self.position.to(device, copy=worker is not None)  # spawned workers share its memory
         return next_keys(seed, self.position, tuple(shape))
 
     def go_to(self, position: int) -> None:

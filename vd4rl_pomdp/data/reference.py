@@ -43,7 +43,8 @@ class Reference:
             known = {"task": dataset.task, "quality": "", "sha256": str(hashes.pop())}
             candidates = (known | {"quality": quality} for quality in ("medium", "expert"))
             actor = next((one for one in candidates if shipped_file(**one)), None)
-        return cls(round(float(dataset.returns.mean()), 4), actor, mean_reward=round(rewards, 6))
+        played = dataset.returns[dataset.episode_end - dataset.episode_start > 1]  # a single row has no step
+        return cls(round(float(played.mean()), 4), actor, mean_reward=round(rewards, 6))
 
     @classmethod
     def read(cls, run: Path) -> Self:

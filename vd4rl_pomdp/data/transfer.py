@@ -74,6 +74,8 @@ def import_set(
     if opened.frame_shape != stored.frame_shape and isinstance(TASKS.get(label), DMCTask):
         means = f"evaluations render {label} at {size}x{size}, which gives other pixels than these means"
         _print([f"{means}: `vd4rl-pomdp data parity {out}` compares them"])
+    rows = _SHARD_ROWS * FRAME_SIZE**2 // max(FRAME_SIZE, opened.frame_shape[0]) ** 2
+    per_shard = max(1, rows * len(numbers) // sum(lengths))
     settings: dict[str, Any] = {
         "format": name,
         "source": opened.record,
@@ -81,9 +83,8 @@ def import_set(
         "task": label,
         "set": quality or opened.quality,
         "frame_size": opened.frame_shape[0],
+        "episodes_per_shard": per_shard,  # a resumed import must not add shards of another division
     }
-    rows = _SHARD_ROWS * FRAME_SIZE**2 // max(FRAME_SIZE, opened.frame_shape[0]) ** 2
-    per_shard = max(1, rows * len(numbers) // sum(lengths))
     attributes = {key: settings[key] for key in ("task", "set") if settings[key]} | {
         "imported": {"format": name, **opened.record}
     }

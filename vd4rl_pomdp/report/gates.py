@@ -47,8 +47,6 @@ UNJUDGED = "not judged: "  # how a verdict begins where nothing is judged, befor
 NOT_REFUTED = "not refuted"  # verdict of an undecided "not below" claim
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"
 DISTANCE = "distance"  # kind of a row that is a measurement, not a claim
-BUDGET = ("updates", "hidden_dim", "steps")
-"""Settings by which a setting's claims are adjusted separately: of the policy, and steps of the pretraining."""
 LEADER, OTHER = "mik+a", "acro"
 OTHERS = {"mik+a minus acro": "method", "mik+a minus acro with a GRU": "gru"}
 """What the leader is compared with, by the difference's name: the other method's `--history`."""
@@ -318,23 +316,26 @@ def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) ->
 
     `difference` is the left side's mean return minus the right's, `low` and `high` its 95% interval, `p` its two-sided
     p value; columns with `clean_` are the same without corruption. A claim of a family is judged by `adjusted_p`,
-    adjusted within a BUDGET, an exploratory one by `p`. `smallest` is the difference that a 5% test with this standard
-    error detects with 80% power; `smallest_share` is the same as a fraction of the data's return. If the sides have no
-    runs with equal settings, these are None and the verdict names the differences. Nothing is judged unless the critics
-    of both sides are known to have converged, nor in settings that are `unranked`.
+    adjusted among pairs with equal settings, an exploratory one by `p`. `smallest` is the difference that a 5% test
+    with this standard error detects with 80% power; `smallest_share` is the same as a fraction of the data's return. If
+    the sides have no runs with equal settings, these are None and the verdict names the differences. Nothing is judged
+    unless the critics of both sides are known to have converged, nor in settings that are `unranked`.
     """
     finished = comparable(runs)
     places = sorted({run.of(GATED) for run in finished})
     found = [one for claim in CLAIMS for place in places for one in _compared(claim, place, finished)]
-    tested = (one for one in found if one[0]["family"] in (PRIMARY, SECOND) and one[0]["p"] is not None)
-    for family in groups(tested, lambda one: (one[0]["family"], *_place(one[0]), _budget(one[1]))).values():
+    tested = [one for one in found if one[0]["family"] in (PRIMARY, SECOND) and one[0]["p"] is not None]
+    methods = [side[0].settings for _, compared in tested for side in (compared.left, compared.right)]
+    known = [name for name in methods[0] if name not in (*load.PLAIN, *load.DATA)] if methods else []
+    shared = [name for name in known if all(name in settings for settings in methods)]  # not options of one method
+
+    def alike(one: tuple[Row, Sides]) -> tuple[str, ...]:
+        return (one[0]["family"], *_place(one[0]), *(one[1].left[0].settings[name] for name in shared))
+
+    for family in groups(tested, alike).values():
         for (row, _), adjusted in zip(family, stats.holm([row["p"] for row, _ in family]), strict=True):
             row["adjusted_p"] = adjusted
     return [row | {"verdict": _verdict(row, compared, _place(row) in unranked)} for row, compared in found]
-
-
-def _budget(compared: Sides) -> tuple[str | None, ...]:
-    return tuple(compared.left[0].settings.get(name) for name in BUDGET)
 
 
 def _compared(claim: ReturnClaim, place: tuple[str, ...], runs: list[Run]) -> Iterator[tuple[Row, Sides]]:
@@ -409,11 +410,15 @@ def opposite(row: Row) -> bool:
 
 
 def tally(rows: list[Row]) -> str:
-    """Summary of a claim over its settings: "holds in 1 of 3 settings; undecided in 1; not judged in 1 (1 REASON)"."""
+    """Summary of a claim over its settings: "holds in 1 of 3 settings; undecided in 1; not judged in 1 (1 REASON)".
+
+    With several budgets in a setting, it counts comparisons.
+    """
     if rows[0]["kind"] == DISTANCE:
         return ""
     counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
-    words = [f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"]
+    noun = "setting" if len({_place(row) for row in rows}) == len(rows) else "comparison"
+    words = [f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} {noun}{'s' * (len(rows) != 1)}"]
     reasons = {name.removeprefix(UNJUDGED): counts.pop(name) for name in [*counts] if name.startswith(UNJUDGED)}
     words += [f"{verdict} in {count}" for verdict, count in counts.items()]
     if reasons:

@@ -146,7 +146,8 @@ class SweepFolder:
 
 def _same(words: list[str], others: list[str]) -> bool:
     """Whether two commands are equal, apart from whether they name a folder by its absolute path."""
-    return words == others or list(map(os.path.abspath, words)) == list(map(os.path.abspath, others))
+    pairs = zip(words, others, strict=False)
+    return len(words) == len(others) and all(a == b or os.path.abspath(a) == os.path.abspath(b) for a, b in pairs)
 
 
 def read_plan(path: Path) -> Plan:

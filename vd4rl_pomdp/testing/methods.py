@@ -180,14 +180,19 @@ def a_resumed_training_takes_the_same_steps(name: str, **settings: Any) -> None:
     claim_equal(here.state_dict(), there.state_dict(), "these differ at the end")
 
 
+def _trains(part: torch.nn.Module | torch.nn.Parameter) -> bool:
+    """False for a frozen network, which an objective may keep to itself."""
+    return any(p.requires_grad for p in ([part] if isinstance(part, torch.nn.Parameter) else part.parameters()))
+
+
 def every_network_is_registered(name: str, **settings: Any) -> None:
-    """Every network and parameter in a list, tuple or dict of an objective is registered with torch."""
+    """Every network and parameter in a list, tuple or dict of an objective is registered with torch, unless frozen."""
     objective = build(name, **settings)
     known = {id(one) for one in (*objective.modules(), *objective.parameters())}
     for path, module in objective.named_modules():
         for key, value in vars(module).items():
             held = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
-            loose = [one for one in held if isinstance(one, torch.nn.Module | torch.nn.Parameter)]
+            loose = [one for one in held if isinstance(one, torch.nn.Module | torch.nn.Parameter) and _trains(one)]
             where = f"{path}.{key}".strip(".")
             claim(known.issuperset(map(id, loose)), f"those in `{where}` are not: use nn.ModuleList, ModuleDict, ...")
 

@@ -194,6 +194,12 @@ def test_verify_finds_a_run_copied_as_another_seed(tmp_path):
     copy = replace(copy, id=identity(copy.record, copy.card))
     write_results(tmp_path, [run, copy])
     assert verify_results(tmp_path)[1] == [f"run {copy.id}: all its returns are those of run {run.id}, another seed"]
+    sparse = [  # a goal is reached, or not
+        replace(one, rows=[row | {"return": row["episode"] % 2, "score": row["episode"] % 2 / 10} for row in one.rows])
+        for one in (run, copy)
+    ]
+    write_results(tmp_path / "sparse", sparse)
+    assert verify_results(tmp_path / "sparse")[1] == []
 
 
 @pytest.mark.parametrize(("name", "key"), [("reference", "data_return"), ("probe", "probe_pose")])
