@@ -1,5 +1,6 @@
 """Writes the commit that is built into wheels and source archives; everything else is in pyproject.toml."""
 
+import shutil
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
@@ -23,7 +24,9 @@ class BuildWithCommit(build_py):
     """Copies the packages, and adds the commit; an editable install asks its checkout instead."""
 
     def run(self) -> None:
-        """Build."""
+        """Build, without modules that an earlier build left there and that no longer exist."""
+        if not self.editable_mode:
+            shutil.rmtree(self.build_lib, ignore_errors=True)
         super().run()
         if not self.editable_mode:
             record_commit(self.build_lib)

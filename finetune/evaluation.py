@@ -234,7 +234,7 @@ def evaluate_run(
     refuse_number("workers", workers, 0)
     evaluated = read_episodes(run / EPISODES_FILE)
     if not evaluated:
-        raise UserError(f"{run}: holds no evaluated run; name one of `vd4rl-pomdp finetune` without --eval-episodes 0")
+        raise UserError(f"{run}: holds no evaluated run; name a run of `vd4rl-pomdp finetune` with evaluations")
     (encoder, card), record = load_encoder(run / "encoder"), read_json(run / CONFIG_FILE)
     what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
     warn_of_other_code(run, record, read_record(run / "encoder").parts, what)

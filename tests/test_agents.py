@@ -196,4 +196,6 @@ def test_batches_of_observations_are_rejected(name):
     obs = np.zeros((agent.encoder.config.channels, agent.picture_size, agent.picture_size), np.uint8)
     with pytest.raises(UserError, match="add or remove leading dimensions"):
         agent.act(obs[None])
+    with pytest.raises(UserError, match="agents read uint8 pixels from 0 to 255, not torch"):
+        agent.act(obs / np.float32(255))
     assert agent.act(obs).shape == (6,)

@@ -65,7 +65,11 @@ class Agent:
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor | np.ndarray) -> np.ndarray:
-        """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
+        """Mean action (A,) float32 for a (C, S, S) uint8 observation; UserError for another shape or scaled pixels."""
+        if not self.encoder.reads_state and torch.as_tensor(obs).dtype != torch.uint8:
+            raise UserError(
+                f"agents read uint8 pixels from 0 to 255, not {torch.as_tensor(obs).dtype}: do not scale them"
+            )
         # step() gives the same states that training computed with encode() on whole windows
         z, self._state = self.encoder.step(torch.as_tensor(obs)[None], self._action, self._state)
         self._action = self.policy(z)

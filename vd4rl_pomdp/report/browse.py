@@ -82,8 +82,13 @@ def write_view(config: ViewConfig) -> Path:
     few = shown[:: -(-count // 5)]
     trial = len(_page(config, view, few, rows)) / len(few) / rows
     rows = min(longest, max(2, int(MOST_BYTES / count / trial)))
-    while len(page := _page(config, view, shown, rows)) > MOST_BYTES and rows > 2:
+    page = _page(config, view, shown, rows)
+    fitting = min(longest, int(0.95 * rows * MOST_BYTES / len(page)))
+    if fitting > rows:  # size grows less than linearly with rows, which share frames
+        rows, page = fitting, _page(config, view, shown, fitting)
+    while len(page) > MOST_BYTES and rows > 2:
         rows = max(2, int(0.95 * rows * MOST_BYTES / len(page)))
+        page = _page(config, view, shown, rows)
     write_bytes(config.out, page)
     return config.out
 

@@ -307,14 +307,17 @@ def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, An
 def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
     """Drop settings that only vary with the dataset (equal within each, not across), e.g. a budget per task.
 
-    Of every run: its settings, its task and quality, and a key; runs of other keys are treated separately.
+    Of every run: its settings, its task and quality, and a key; runs of other keys are treated separately. PLAIN
+    settings are part of a method's name and stay.
     """
     # A per-task budget is no ablation. As a variant it would split a method in two, with gaps on every other task.
     kept = [dict(one) for one in settings]
     for places in groups(range(len(settings)), alike.__getitem__).values():
         table = pd.DataFrame([settings[i] for i in places]).drop(columns=[ENCODER_SEED, *DATA], errors="ignore")
         by_set = table.groupby([sets[i] for i in places]).nunique()
-        dropped = [name for name in table if by_set[name].max() == 1 and table[name].nunique() > 1]
+        dropped = [
+            name for name in table if by_set[name].max() == 1 and table[name].nunique() > 1 and name not in PLAIN
+        ]
         for i in places:
             kept[i] = without(kept[i], dropped)
     return kept

@@ -33,6 +33,7 @@ from vd4rl_pomdp.core.reading import damaged
 from vd4rl_pomdp.core.tasks import UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.probes import probe_r2
 from vd4rl_pomdp.report.gates import STATE_SHARE, converged, episodes_of
@@ -124,6 +125,8 @@ def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: boo
     try:
         with owned(place):  # another process may add a certificate at the same time
             keep_certificates(place, made)
+            if (place / "card.md").exists():
+                write_card(place)
     except UserError as error:  # a shared dataset may be read-only
         print(f"warning: {error}; the certificate is only in {out}", file=sys.stderr)
     return certificate
