@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from offline_table import signed
 
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.text import table_lines
@@ -224,17 +225,13 @@ def rung_lines(cells: Sequence[Cell]) -> Iterator[str]:
                     rung: [value - other.returns[rung][seed] for seed, value in mine.items()]
                     for rung, mine in one.returns.items()
                 }
-                line = {rung: _signed(mean_and_error(values)) for rung, values in apart.items()}
+                line = {rung: signed(mean_and_error(values)) for rung, values in apart.items()}
                 mean = np.mean([np.mean(values) for values in apart.values()])
-                rows.append((cell, f"{one.key.called} minus {other.key.called}", line, _signed(f"{mean:.0f}")))
+                rows.append((cell, f"{one.key.called} minus {other.key.called}", line, signed(f"{mean:.0f}")))
     table = (
         (cell.key.setting, called, *(line.get(rung, "") for rung in rungs), mean) for cell, called, line, mean in rows
     )
     return table_lines(("set", "return of", *(f"{rung:,}" for rung in rungs), "mean"), table, (0, 1))
-
-
-def _signed(text: str) -> str:
-    return text if text.startswith("-") else f"+{text}"
 
 
 def budget_lines(cells: Sequence[Cell]) -> Iterator[str]:

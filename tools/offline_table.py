@@ -147,7 +147,12 @@ def _difference(runs: Sequence[Run], corruption: str, method: str, other: str, c
     """Difference of two methods' mean returns with its interval; a dash if either was not evaluated so."""
     above, ends = difference(sides(_of(runs, method, corruption), _of(runs, other, corruption)), clean)
     text = with_interval(above, *ends, 0)
-    return text if above is None or text.startswith("-") else f"+{text}"
+    return text if above is None else signed(text)
+
+
+def signed(text: str) -> str:
+    """A number in words with its sign."""
+    return text if text.startswith("-") else f"+{text}"
 
 
 def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:

@@ -16,38 +16,38 @@ import offline_table as offline
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from protocol_table import GRU, called
 
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.report.figures import COLOURS, sheet
 from vd4rl_pomdp.report.gates import episodes_of
-from vd4rl_pomdp.report.load import Run, label
+from vd4rl_pomdp.report.load import Run
 from vd4rl_pomdp.report.stats import mean_interval
+from vd4rl_pomdp.runs.files import groups
 
 TASKS_SHOWN, QUALITIES = ("cheetah_run", "walker_walk", "humanoid_walk"), ("expert", "medium_expert")
 METHODS = ("mik+a", "mik", "ah+a", "ah", "fj+a", "fj", "acro", "driml", "homer", "curl", "one_step_inverse")
-SAME = {"acro, history gru": "ah"}
-"""Labels of runs that compute another method of the paper: `acro` with a GRU and a shared shift is AH."""
-HIDDEN = {"patch": "patches", "patch+zero_frames": "patches and zeroed frames"}
+HIDDEN = ("patch", "patch+zero_frames")
 
 
 def figures(runs: Sequence[Run]) -> dict[str, Figure]:
     """A figure for each of the paper's corruptions under which any run was evaluated, by corruption."""
     found = {}
     for corruption in HIDDEN:
-        panels = []
-        for quality, task in product(QUALITIES, TASKS_SHOWN):
-            place = (task, quality, corruption)
-            mine = [run for run in runs if run.of(("task", "quality", "corruption")) == place]
-            panels.append((f"{task} {quality}", pd.DataFrame(), partial(_draw, mine)))
-        if any(part.args[0] for *_, part in panels):
+        here = [run for run in runs if run.labels["corruption"] == corruption]
+        if here:
+            panels = []
+            for quality, task in product(QUALITIES, TASKS_SHOWN):
+                mine = [run for run in here if run.of(("task", "quality")) == (task, quality)]
+                panels.append((f"{task} {quality}", pd.DataFrame(), partial(_draw, mine)))
             found[corruption] = sheet(panels, 3, [2.6] * len(panels))
     return found
 
 
 def _draw(runs: list[Run], axes: Axes, _: pd.DataFrame) -> None:
-    called = [SAME.get(label(run.named), label(run.named)) for run in runs]
+    by_method = groups(runs, lambda run: called(run).replace(GRU, "ah"))
     for place, method in enumerate(METHODS):
-        mine = [run for run, name in zip(runs, called, strict=True) if name == method]
+        mine = by_method.get(method)
         if not mine:
             axes.text(1, place, "not run", va="center", fontsize=6, color="grey")
             continue

@@ -47,15 +47,17 @@ def _of_seeds(returns: np.ndarray) -> str:
 
 
 GRU = "acro, history gru"
+"""`acro` with a GRU. With a shared shift, as in all grids, it is the paper's AH."""
 PAIRS = (("mik", "acro"), (GRU, "acro"), ("mik+a", "mik"), ("mik+a", "acro"), ("mik+a", GRU))
+
+
+def called(run: Run) -> str:
+    """A run's method or GRU, whatever its budget: labels name a budget where runs of several are loaded."""
+    return GRU if run.method == "acro" and run.settings.get("history") == "gru" else run.method
 
 
 def paired_lines(runs: Sequence[Run]) -> Iterator[str]:
     """Differences paired by training seed, since methods share its dataset; where three seeds were evaluated clean."""
-
-    def called(run: Run) -> str:
-        return GRU if run.method == "acro" and run.settings["history"] == "gru" else run.method
-
     rows = []
     by_place = groups(runs, lambda run: (*run.of(("task", "quality", "corruption")), run.settings["updates"]))
     for (*place, updates), here in by_place.items():

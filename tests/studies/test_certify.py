@@ -8,27 +8,15 @@ import numpy as np
 import pytest
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_data import fake_rows, write_fake_set
+from tests.helpers_data import write_fake_set
 from tests.helpers_report import describe, without_figures, write_run
 from tests.helpers_stages import contents
 from vd4rl_pomdp.cli import main, studies
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, NEEDS_NOT, OPEN, judge
 
 pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-@pytest.fixture
-def states(tmp_path):
-    """A dataset of ten short episodes with states."""
-    rows = fake_rows([9] * 10, physics_dim=18)
-    rows["physics"] = np.random.default_rng(0).normal(size=(90, 18))
-    folder = tmp_path / "walker_walk" / "expert"
-    folder.mkdir(parents=True)
-    write_shard(folder / "0_set.hdf5", rows, {})
-    return folder
 
 
 @pytest.fixture

@@ -7,27 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.helpers_data import fake_rows
 from tests.helpers_report import write_seeds
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.studies import certify
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, OPEN, STATE
 
 pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-@pytest.fixture
-def states(tmp_path) -> Path:
-    """A dataset of ten episodes with random states, so that two are held out."""
-    rows = fake_rows([9] * 10, physics_dim=18)
-    rows["physics"] = np.random.default_rng(0).normal(size=(90, 18))
-    folder = tmp_path / "walker_walk" / "expert"
-    folder.mkdir(parents=True)
-    write_shard(folder / "0_set.hdf5", rows, {})
-    return folder
 
 
 class StopError(Exception):

@@ -66,12 +66,11 @@ class Agent:
     @torch.no_grad()
     def act(self, obs: torch.Tensor | np.ndarray) -> np.ndarray:
         """Mean action (A,) float32 for a (C, S, S) uint8 observation; UserError for another shape or scaled pixels."""
-        if not self.encoder.reads_state and torch.as_tensor(obs).dtype != torch.uint8:
-            raise UserError(
-                f"agents read uint8 pixels from 0 to 255, not {torch.as_tensor(obs).dtype}: do not scale them"
-            )
+        obs = torch.as_tensor(obs)
+        if not self.encoder.reads_state and obs.dtype != torch.uint8:
+            raise UserError(f"agents read uint8 pixels from 0 to 255, not {obs.dtype}: do not scale them")
         # step() gives the same states that training computed with encode() on whole windows
-        z, self._state = self.encoder.step(torch.as_tensor(obs)[None], self._action, self._state)
+        z, self._state = self.encoder.step(obs[None], self._action, self._state)
         self._action = self.policy(z)
         return self._action[0].numpy().copy()  # a caller's `action += noise` must not change the history
 
