@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from earlier_table import signed
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from offline_table import signed
 
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.text import table_lines

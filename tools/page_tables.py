@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import earlier_table as earlier
 import ladder_table as ladder
 import navigation_table as mazes
-import offline_table as offline
 import protocol_table as protocol
 
 from vd4rl_pomdp.core.errors import UserError
@@ -26,18 +26,21 @@ Tables = dict[str, Iterable[str]]
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, by the page's path in the repository."""
-    frozen = offline.runs_of([str(ROOT / "results" / "protocol.toml")], ["protocol"], protocol.SECOND_BUDGETS)
-    methods, returns = offline.runs_of(["methods"], ["methods", "offline", "control"]), offline.main_runs()
+    frozen = earlier.runs_of([str(ROOT / "results" / "protocol.toml")], ["protocol"], protocol.SECOND_BUDGETS)
+    methods, returns = earlier.runs_of(["methods"], ["earlier/methods", *earlier.FOLDERS]), earlier.main_runs()
     numbers, rungs, condition = mazes.numbers_in(), ladder.cells_in(), mazes.Condition("", "")
     by_k = [(f"K = {k}", condition._replace(max_k=k)) for k in (15, 1)]
     tables: dict[str, Tables] = {
-        "control": {"gates": offline.gate_lines(returns), "ranks": offline.rank_lines(returns)},
+        "earlier": {
+            "returns": earlier.return_lines(returns),
+            "contrasts": earlier.contrast_lines(returns),
+            "methods": earlier.method_lines(methods),
+        },
         "ladder": {
             "runs": ladder.run_lines(rungs),
             "rungs": ladder.rung_lines(rungs),
             "budget": ladder.budget_lines(rungs),
         },
-        "methods": {"methods": offline.method_lines(methods)},
         "navigation": {
             "mazes": mazes.state_lines(numbers, by_k),
             "three_curtains": mazes.maze_lines(numbers, "three_curtains"),
@@ -51,11 +54,6 @@ def pages() -> dict[str, Tables]:
             "first rung": mazes.place_lines(
                 mazes.numbers_in("first_person/small"), (mazes.STARS, mazes.COMPASS), mazes.SMALLEST
             )
-        },
-        "offline": {
-            "returns": offline.return_lines(returns),
-            "contrasts": offline.contrast_lines(returns),
-            "aggregate": offline.aggregate_lines(returns),
         },
         "protocol": {
             "methods": protocol.method_lines(frozen),

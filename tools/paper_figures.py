@@ -1,6 +1,6 @@
 """Draw the paper's two offline figures (patches; patches and zeroed frames) in its layout, from the rows of a page.
 
-    python tools/paper_figures.py        writes figures/paper_CORRUPTION.png of results/offline and results/protocol
+    python tools/paper_figures.py        writes figures/paper_CORRUPTION.png of results/earlier and results/protocol
 
 Panels are the paper's tasks and qualities, rows its methods. What was not run is shown as such.
 """
@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import product
 
+import earlier_table as earlier
 import numpy as np
-import offline_table as offline
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -66,10 +66,10 @@ def _draw(runs: list[Run], axes: Axes, _: pd.DataFrame) -> None:
 
 def main() -> None:
     """Write the figures of both pages."""
-    frozen = offline.runs_of([str(offline.RESULTS / "protocol.toml")], ["protocol"])
-    for page, runs in {"offline": offline.main_runs(), "protocol": frozen}.items():
+    frozen = earlier.runs_of([str(earlier.RESULTS / "protocol.toml")], ["protocol"])
+    for page, runs in {"earlier": earlier.main_runs(), "protocol": frozen}.items():
         for corruption, figure in figures(runs).items():
-            figure.savefig(offline.RESULTS / page / "figures" / f"paper_{corruption}.png", dpi=100)
+            figure.savefig(earlier.RESULTS / page / "figures" / f"paper_{corruption}.png", dpi=100)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from operator import itemgetter
 
 import numpy as np
-from offline_table import CLEAN, mean_text
+from earlier_table import CLEAN, mean_text
 
 from vd4rl_pomdp.core.text import table_lines
 from vd4rl_pomdp.report.gates import (

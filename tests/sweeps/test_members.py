@@ -19,7 +19,7 @@ from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
-RESULTS = Path(__file__).parents[2] / "results"
+EARLIER = Path(__file__).parents[2] / "results" / "earlier"
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
 GRID = """
 seed = [0, 1]
@@ -90,12 +90,12 @@ def test_uncollected_datasets_match_by_name(grid, runs):
 
 def test_offline_page_counts_its_cells():
     cells = load_grid("offline").cells()
-    own, control = read_results(RESULTS / "offline"), read_results(RESULTS / "control")
+    own, control = read_results(EARLIER / "offline"), read_results(EARLIER / "control")
     found = GridMembers("offline", cells).among([*own, *control])
     assert found[: len(own)] == own
     assert {run.record["config"]["update_precision"] for run in found} == {"bf16"}
     assert {run.encoder["settings"]["history"] for run in found if run.encoder} == {"method"}
-    page = (RESULTS / "offline" / "README.md").read_text()
+    page = (EARLIER / "README.md").read_text()
     measured, asked = re.search(r"(\d+) of the (\d+) cells of the grid", page).groups()
     assert (int(measured), int(asked)) == (len(found), len(cells))
 
@@ -105,7 +105,7 @@ def test_committed_runs_cover_the_documented_grid_except_the_new_method(tmp_path
     (text,) = (block for block in blocks if "past_to_frame" in block)
     (tmp_path / "grid.toml").write_text(text.replace(', "past_to_frame"', ""))
     cells = load_grid(str(tmp_path / "grid.toml")).cells()
-    kept = [run for name in ("control", "offline") for run in read_results(RESULTS / name)]
+    kept = [run for name in ("control", "offline") for run in read_results(EARLIER / name)]
     assert len(GridMembers("grid", cells).among(kept)) == len(cells) == 12
 
 

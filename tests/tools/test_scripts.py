@@ -57,8 +57,8 @@ def test_tables_are_replaced_under_their_marks(monkeypatch):
 
 def test_papers_figure_has_a_panel_per_set_and_shows_what_was_not_run(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
-    script, offline = importlib.import_module("paper_figures"), importlib.import_module("offline_table")
-    (drawn,) = script.figures(offline.runs_of([str(offline.RESULTS / "protocol.toml")], ["protocol"])).values()
+    script, tables = importlib.import_module("paper_figures"), importlib.import_module("earlier_table")
+    (drawn,) = script.figures(tables.runs_of([str(tables.RESULTS / "protocol.toml")], ["protocol"])).values()
     panels = {axes.get_title(): axes for axes in drawn.axes}
     assert len(panels) == len(script.TASKS_SHOWN) * len(script.QUALITIES)
     assert [text.get_text() for text in panels["humanoid_walk expert"].texts] == ["not run"] * len(script.METHODS)

@@ -114,7 +114,7 @@ def conclusion(jobs: list[planning.Job]) -> Iterator[str]:
         known = ", ".join(f"{probe[name]:.0f}" for name in load.PROBES)
         yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
     yield "One seed each: between seeds probe errors hardly vary, but returns do."
-    yield "Three seeds on 100 episodes: results/control."
+    yield "Three seeds on 100 episodes: results/earlier."
 
 
 def show_navigation(jobs: list[planning.Job], film: Path) -> Iterator[str]:

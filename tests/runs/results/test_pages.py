@@ -30,9 +30,9 @@ SENTENCE = re.compile(r"\.\s|\n\n")
 """The end of a sentence."""
 GENERATED = re.compile(r"<!-- table: .* -->\n(?:\|.*\n)*")
 """Tables that scripts write; tests/tools/test_scripts.py compares them with the rows."""
-MAIN = ("control", "offline")
+MAIN = ("earlier/control", "earlier/offline")
 """Folders whose rows are pooled."""
-ASIDE = ("control/budget", "control/histories", "control/expert", "protocol")
+ASIDE = ("earlier/control/budget", "earlier/control/histories", "earlier/control/expert", "protocol")
 REPORTS = sorted(found.parent for found in (ROOT / "results" / "navigation").rglob("tables.csv"))
 MEASURES = (
     *(online_error(component).raw() for component in ("state", "position", "velocity")),
@@ -93,7 +93,7 @@ def of_pairs(folders: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
 
 def of_shifts() -> Iterator[str]:
     """Quotable returns of `acro` with its authors' random shift, compared with `acro` as the grids train it."""
-    runs = [run for name in ("control", "control/budget") for run in load_runs([ROOT / "results" / name])]
+    runs = load_runs([ROOT / "results" / "earlier" / name for name in ("control", "control/budget")])
     groups = defaultdict(list)
     for run in runs:
         if run.set_name == "walker_walk expert_noisy" and run.method in ("acro", "acro_shifted"):
@@ -174,9 +174,8 @@ def unknown_pairs(text: str, known: set[tuple[str, str, str]]) -> list[tuple[str
         ("docs/methods/ah.md", 1),
         ("docs/methods/supervised.md", 2),
         ("results/README.md", 3),
-        ("results/offline/README.md", 8),
+        ("results/earlier/README.md", 9),
         ("results/protocol/README.md", 4),
-        ("results/control/README.md", 11),
         ("results/gpu/README.md", 4),
         ("results/navigation/README.md", 7),
     ],

@@ -1,4 +1,4 @@
-"""Make the tables of results/offline, results/control and results/methods/README.md from the rows there."""
+"""Make the tables of results/earlier/README.md from the rows of its folders."""
 
 from __future__ import annotations
 
@@ -9,22 +9,19 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
-from scipy.stats import spearmanr
 
 from vd4rl_pomdp.core.text import table_lines
-from vd4rl_pomdp.report import load
-from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, difference, episodes_of, gates, returns_of, sides
-from vd4rl_pomdp.report.load import PROBES, TRAINED_ON_STATES, Run, episodes_frame, load_runs, runs_frame
+from vd4rl_pomdp.report.gates import difference, episodes_of, returns_of, sides
+from vd4rl_pomdp.report.load import PROBES, TRAINED_ON_STATES, Run, load_runs
 from vd4rl_pomdp.report.stats import mean_interval, number, with_interval
-from vd4rl_pomdp.report.tables import aggregate, evaluations, improvement
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import Row, groups
+from vd4rl_pomdp.runs.files import groups
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 
 RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
+FOLDERS = tuple(f"earlier/{name}" for name in GRIDS)
 HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
 ALONE = ", patches only"
 """Suffix of a dataset's name for patches without zeroed frames."""
@@ -51,23 +48,18 @@ CONTRASTS = {
 """The paper's claims, as differences of returns."""
 CORRUPTIONS = {"patch+zero_frames": "patches and frames", "none": "nothing"}
 """Names of corruptions in the table of methods, in column order."""
-ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
+ASIDE = RESULTS / "earlier" / "offline" / "clean_evaluation.csv"
 """Clean evaluations of policies, made after their runs had ended."""
 PLACE = ("task", "quality")
 IDENTIFIED = (*PLACE, "corruption", "method", "seed")
 """Columns of ASIDE that identify a run."""
-ERRORS = {
-    **dict(zip(PROBES, ("probe of the pose", "probe of the velocity"), strict=True)),
-    **dict(zip(load.ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
-}
-"""Errors to correlate with returns, by column of the frame of runs."""
 
 
 def main_runs() -> list[Run]:
     """Finished TD3+BC runs of the grids offline and control, without variants, with the clean evaluations of ASIDE."""
     aside = groups(read_episodes(ASIDE), itemgetter(*IDENTIFIED))
     found = []
-    for run in runs_of(GRIDS, GRIDS):
+    for run in runs_of(GRIDS, FOLDERS):
         if not run.variant:
             clean = [] if run.last_clean else aside.get(run.of(IDENTIFIED), [])
             found.append(replace(run, result=replace(run.result, rows=[*run.result.rows, *clean])))
@@ -153,75 +145,6 @@ def _difference(runs: Sequence[Run], corruption: str, method: str, other: str, c
 def signed(text: str) -> str:
     """A number in words with its sign."""
     return text if text.startswith("-") else f"+{text}"
-
-
-def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """The report's statistics over datasets, for methods that all of them have."""
-    main = [run for run in runs if run.labels["corruption"] in (HIDDEN, PATCHES) and run.method in MAIN]
-    kinds = groups(
-        (run for run in main if run.of(PLACE) in SETS),
-        lambda run: (run.labels["quality"] in EXPLORATORY, run.labels["corruption"]),
-    )
-    rows = []
-    for (exploratory, corruption), mine in kinds.items():
-        kind = ("noisy, exploratory" if exploratory else "of the paper's qualities") + ALONE * (corruption == PATCHES)
-        evaluated = evaluations(episodes_frame(mine))
-        chances = improvement(evaluated)
-        above = chances[chances["method"] == "mik+a"].set_index("other")
-        found = aggregate(evaluated, pd.DataFrame(columns=list(load.CONDITION)))
-        for row in found.sort_values("mean", ascending=False, kind="stable").to_dict("records"):
-            cells = [with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"]) for name in ("iqm", "mean")]
-            known = row["method"] in above.index
-            chance = above.loc[row["method"], ["probability", "low", "high"]] if known else [None] * 3
-            rows.append((f"{row['tasks']} {kind}", f"`{row['method']}`", *cells, with_interval(*chance, 2)))
-    return table_lines(
-        ("sets", "method", "interquartile mean", "mean", "probability that `mik+a` is better"), rows, (0, 1)
-    )
-
-
-def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """Conditions that a dataset must meet before methods are ranked on it."""
-    rows = []
-    for row in _judged(runs):
-        few = {name: f" (n = {row[f'{name}_seeds']})" * (row[f"{name}_seeds"] < 3) for name in ("state", "acro")}
-        shares = [number(row[f"{name}_share"], 2) + words for name, words in few.items()]
-        shares += [f"{number(row['acro_bar'], 2)} ({row['bar_from']})", number(row["best_share"], 2)]
-        above = with_interval(row["above_random"], row["low"], row["high"], 0)
-        rows.append((row["name"], f"{row['data_return']:.0f}", *shares, above, row["passed"]))
-    shares = ("`state` / data", "`acro` with nothing hidden / data", "its threshold (published score)", "best / data")
-    return table_lines(("set", "data's return", *shares, "best minus `random`", "passed"), rows, (0, 7))
-
-
-def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
-    """Rank correlation of policy diagnostics with returns on each dataset, with and without untrained encoders."""
-    frame, rows = runs_frame(runs), []
-    frame = frame[frame[PROBES[0]].notna() & ~frame["method"].isin(TRAINED_ON_STATES)]  # with a held-out probe
-    for row in _judged(runs):
-        places = ["task", "quality", "corruption"]
-        probed = frame[(frame[places] == [row[name] for name in places]).all(axis=1)]
-        trained = probed[probed["method"] != UNTRAINED]
-        cells = (f"{_rank_correlation(probed, name)}, {_rank_correlation(trained, name)}" for name in ERRORS)
-        rows.append((row["name"], row["passed"], f"{len(probed)}, {len(trained)}", *cells))
-    return table_lines(("set", "passed", "runs", *ERRORS.values()), rows, (0, 1))
-
-
-def _judged(runs: Sequence[Run]) -> Iterator[Row]:
-    """Gates of the pages' datasets, by their `name`s there, and whether they are `passed`."""
-    for row in gates(list(runs)):
-        place = row["task"], row["quality"]
-        if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
-            passed = {PASSED: "yes", FAILED: "undecided", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
-            yield row | {"name": _name(*place, row["corruption"]), "passed": passed}
-
-
-def _rank_correlation(frame: pd.DataFrame, error: str) -> str:
-    """Spearman correlation of an error and the return over runs: -1 if a smaller error always has a larger return.
-
-    A dash for a single run, or if a run lacks the error.
-    """
-    if len(frame) < 2 or frame[error].isna().any():
-        return number(None)
-    return f"{spearmanr(frame[error], frame['return']).statistic:.2f}"
 
 
 def method_lines(runs: Sequence[Run]) -> Iterator[str]:
