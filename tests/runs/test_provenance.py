@@ -72,8 +72,6 @@ def test_wheel_contains_its_commit(checkout):
         ("/src/vd4rl_pomdp/__main__.py", "vd4rl-pomdp"),
         ("/src/vd4rl_pomdp/cli/__main__.py", "vd4rl-pomdp"),
         ("-c", "vd4rl-pomdp"),
-        ("/src/pretrain/__main__.py", "vd4rl-pomdp pretrain"),
-        ("/src/finetune/__main__.py", "vd4rl-pomdp finetune"),
         ("folder/my_method.py", "python my_method.py"),
     ],
 )

@@ -101,7 +101,7 @@ def command(stage: str = "", words: Sequence[str] | None = None) -> str:
     """
     script = Path(sys.argv[0])
     program = [*["python"] * (script.suffix == ".py"), script.name]
-    if script.name in ("__main__.py", "-c"):  # python -m PACKAGE, or a spawned worker
-        program = ["vd4rl-pomdp", *([script.parent.name] if script.parent.name in ("pretrain", "finetune") else [])]
+    if script.name in ("__main__.py", "-c"):  # python -m vd4rl_pomdp, or a spawned worker
+        program = ["vd4rl-pomdp"]
     given = sys.argv[1:] if words is None else [*(word for word in sys.argv[1:2] if word == stage), *words]
     return shlex.join([*program, *given])
