@@ -54,7 +54,8 @@ COMMANDS = {
     "bench": ("studies.bench", "measure speed and memory on this machine"),
 }
 """Function (within this package) and summary of every command. A function takes the words after its name, and the
-program name. Its module is imported on call: imports can take seconds (torch), and listing commands needs none.
+program name. Its module is imported on call: imports can take seconds (torch), and listing commands needs none. For
+their `--help` to need none either, functions import what loads torch.
 """
 
 

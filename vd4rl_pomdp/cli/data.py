@@ -5,31 +5,12 @@ from __future__ import annotations
 import itertools
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.sweeps.options import program_name
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.data import card as cards
-    from vd4rl_pomdp.data import check as checking
-    from vd4rl_pomdp.data import collect as collection
-    from vd4rl_pomdp.data import download as published
-    from vd4rl_pomdp.data import parity as pixels
-    from vd4rl_pomdp.data import transfer
-    from vd4rl_pomdp.report import browse
-else:
-    cards = Later("vd4rl_pomdp.data.card")
-    checking = Later("vd4rl_pomdp.data.check")
-    collection = Later("vd4rl_pomdp.data.collect")
-    published = Later("vd4rl_pomdp.data.download")
-    pixels = Later("vd4rl_pomdp.data.parity")
-    transfer = Later("vd4rl_pomdp.data.transfer")
-    browse = Later("vd4rl_pomdp.report.browse")
 
 REPLAY_TOLERANCE = 1e-6
 """Largest accepted difference between stored and replayed rewards; 0 on the machine that collected them."""
@@ -37,6 +18,8 @@ REPLAY_TOLERANCE = 1e-6
 
 def collect(words: list[str], program: str) -> None:
     """Collect a dataset."""
+    from vd4rl_pomdp.data import collect as collection
+
     config = parse(collection.CollectConfig, words, program)
     shards = collection.collect(config)
     print(f"shards in {config.out}: {len(shards)}, described in {config.out / 'card.md'}")
@@ -60,6 +43,8 @@ def download(
         endpoint: Address of a mirror; default: HF_ENDPOINT, else https://huggingface.co.
         verify: Also check the SHA-256 of files that exist already.
     """
+    from vd4rl_pomdp.data import download as published
+
     published.check_published(task, quality)  # reject unknown names before the first download, which takes hours
     for one, level in itertools.product(task, quality):
         shards = published.download(one, level, out, endpoint, verify)
@@ -93,6 +78,8 @@ def import_set(
         clip_actions: Clip actions outside the source's bounds instead of rejecting them.
         shortest: Leave out episodes of fewer rows.
     """
+    from vd4rl_pomdp.data import transfer
+
     shards = transfer.import_set(format, source, out, task, quality, size, picture, clip_actions, shortest)
     print(f"shards in {out}: {len(shards)}, described in {out / 'card.md'}")
 
@@ -112,6 +99,8 @@ def export_set(
         out: Output folder.
         size: Height and width to resize frames to, by area; default: no resizing.
     """
+    from vd4rl_pomdp.data import transfer
+
     transfer.export_set(format, set, out, size)
     print(f"exported to {out}")
 
@@ -123,12 +112,16 @@ def card(set: tyro.conf.Positional[Path]) -> None:
     Args:
         set: Dataset folder.
     """
-    print(f"card: {cards.write_card(set)}")
+    from vd4rl_pomdp.data.card import write_card
+
+    print(f"card: {write_card(set)}")
 
 
 def view(words: list[str], program: str) -> None:
     """Write an HTML page to browse episodes."""
-    print(f"page: {browse.write_view(parse_stage(browse.ViewConfig, words, program))}")
+    from vd4rl_pomdp.report.browse import ViewConfig, write_view
+
+    print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
 
 
 @command
@@ -139,7 +132,9 @@ def check(set: tyro.conf.Positional[Path], json: bool = False) -> None:
         set: Dataset folder.
         json: Print one JSON object.
     """
-    result = checking.check_dataset(set)
+    from vd4rl_pomdp.data.check import check_dataset
+
+    result = check_dataset(set)
     show(result, json)
     error = result["replay_max_error"]
     if error is not None and not error <= REPLAY_TOLERANCE:  # also NaN
@@ -157,7 +152,9 @@ def parity(set: tyro.conf.Positional[Path | None] = None, json: bool = False) ->
         set: Compare this dataset's background; without it, the reference frames are compared.
         json: Print one JSON object.
     """
-    result = pixels.check_parity(set)
+    from vd4rl_pomdp.data.parity import check_parity
+
+    result = check_parity(set)
     show(result, json)
     if not result["equal"] and set:
         raise UserError(f"the environment's background differs from that of {set}: see `background` above")

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vd4rl_pomdp.cli.hub import play
-from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.cli.report import report
 from vd4rl_pomdp.cli.sweeps import carry_out
@@ -29,21 +28,7 @@ from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.options import LocalOptions
 
 if TYPE_CHECKING:
-    from vd4rl_pomdp.report import load
-    from vd4rl_pomdp.runs import workers
-    from vd4rl_pomdp.studies.navigation import figures
-    from vd4rl_pomdp.studies.navigation import runs as mazes
-    from vd4rl_pomdp.sweeps import driver
-    from vd4rl_pomdp.sweeps import folder as folders
-    from vd4rl_pomdp.sweeps import plan as planning
-else:
-    load = Later("vd4rl_pomdp.report.load")
-    workers = Later("vd4rl_pomdp.runs.workers")
-    figures = Later("vd4rl_pomdp.studies.navigation.figures")
-    mazes = Later("vd4rl_pomdp.studies.navigation.runs")
-    driver = Later("vd4rl_pomdp.sweeps.driver")
-    folders = Later("vd4rl_pomdp.sweeps.folder")
-    planning = Later("vd4rl_pomdp.sweeps.plan")
+    from vd4rl_pomdp.sweeps.plan import Job
 
 GRIDS = {"runs": "quick"} | ({"navigation": "quick_navigation"} if find_spec("gymnasium_robotics") else {})
 """Grid by output folder; mazes only if their extra is installed."""
@@ -57,13 +42,15 @@ MOST_AT_ONCE = 4
 """Maximum concurrent jobs; more would not finish sooner."""
 
 
-def demo_jobs(out: Path, preset: str = "cpu") -> list[planning.Job]:
+def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
     """The demo's jobs, in order; UserError for an unknown preset."""
+    from vd4rl_pomdp.sweeps.plan import plan_jobs
+
     refuse_unknown("preset", preset, PRESETS)
     jobs = []
     for folder, grid in GRIDS.items():
         runs, cells = out / folder, load_grid(grid, testing=PRESETS[preset]).cells()
-        jobs += planning.plan_jobs(cells, runs, out / "data")[0]
+        jobs += plan_jobs(cells, runs, out / "data")[0]
     return jobs
 
 
@@ -76,13 +63,17 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
         jobs: Concurrent jobs; 0: as many as the GPUs take, or one per core up to 4.
         preset: cpu: minutes; smoke: only tests that every stage runs.
     """
+    from vd4rl_pomdp.runs.workers import count_workers
+    from vd4rl_pomdp.sweeps.driver import visible_gpus
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+
     started = time.monotonic()
-    at_once = 0 if driver.visible_gpus() else min(workers.count_workers(0), MOST_AT_ONCE)  # 0: one per GPU
+    at_once = 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)  # 0: one per GPU
     options = LocalOptions(jobs=jobs or at_once)
     options.check()
     refuse_no_folder(out)
     refuse_kept(out)
-    planned, folder = demo_jobs(out, preset), folders.SweepFolder(out)
+    planned, folder = demo_jobs(out, preset), SweepFolder(out)
     play([*PAIR, "--episodes", "1" if PRESETS[preset] else "10", "--film", str(out / DUEL)], "vd4rl-pomdp agents play")
     print("One training seed each. All seeds: results/protocol. Now the same from the start, small:", flush=True)
     words = ["report", str(out / "runs"), "--out", str(out / "report")]
@@ -99,8 +90,10 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
 
 
-def conclusion(jobs: list[planning.Job]) -> Iterator[str]:
+def conclusion(jobs: list[Job]) -> Iterator[str]:
     """Summary lines: probe errors and returns of the demo's methods, with standard errors."""
+    from vd4rl_pomdp.report.load import PROBES
+
     policies = [(job.settings, job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
     yield f"Under {corruption}, errors of linear probes for pose and velocity (in % of a"
@@ -111,17 +104,20 @@ def conclusion(jobs: list[planning.Job]) -> Iterator[str]:
         last = max(row["step"] for row in rows)
         returns = [row["return"] for row in rows if row["step"] == last]
         probe = read_json(folder / PROBE_FILE)
-        known = ", ".join(f"{probe[name]:.0f}" for name in load.PROBES)
+        known = ", ".join(f"{probe[name]:.0f}" for name in PROBES)
         yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
     yield "One seed each: between seeds probe errors hardly vary, but returns do."
     yield "Three seeds on 100 episodes: results/earlier."
 
 
-def show_navigation(jobs: list[planning.Job], film: Path) -> Iterator[str]:
+def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
     """Write the video; yield lines with each method's position error while a curtain hides the mass."""
+    from vd4rl_pomdp.studies.navigation import runs as mazes
+    from vd4rl_pomdp.studies.navigation.figures import write_film
+
     runs = mazes.load_runs(mazes.find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
     trajectories = {run.condition.method: run.trajectory for run in runs if run.trajectory is not None}
-    figures.write_film(trajectories, get_maze(runs[0].condition.maze), film)
+    write_film(trajectories, get_maze(runs[0].condition.maze), film)
     yield "Held-out position error behind curtains, % of a standard deviation (one seed):"
     for run in runs:
         error = run.values.get(mazes.refitted_error("position", rows="hidden"))

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
 
-from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
-
-if TYPE_CHECKING:
-    from finetune import export as exporting
-    from vd4rl_pomdp import hub
-    from vd4rl_pomdp.report import films
-else:
-    exporting = Later("finetune.export")
-    hub = Later("vd4rl_pomdp.hub")
-    films = Later("vd4rl_pomdp.report.films")
 
 
 @command
@@ -44,6 +33,8 @@ def push(
         revision: Branch to write to; created if missing.
         license: Licence for its card, as the Hub spells it.
     """
+    from vd4rl_pomdp import hub
+
     print(hub.push(folder, repository, private, revision, license))
 
 
@@ -56,6 +47,8 @@ def pull(repository: tyro.conf.Positional[str], folder: tyro.conf.Positional[Pat
         folder: New or empty folder.
         revision: Branch, tag or commit.
     """
+    from vd4rl_pomdp import hub
+
     fetched = hub.pull(repository, folder, revision)
     print(f"{folder}: {'downloaded and verified' if fetched else 'already present and verified'}")
 
@@ -70,7 +63,9 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
         episodes: Episodes played by the exported agent for its card, with and without its corruption.
         workers: Worker processes; 0 uses every core.
     """
-    card = exporting.export_agent(run, out, episodes, workers)
+    from finetune.export import export_agent
+
+    card = export_agent(run, out, episodes, workers)
     for under in dict.fromkeys(row["evaluated_under"] for row in card["episodes"]):
         returns = [row["return"] for row in card["episodes"] if row["evaluated_under"] == under]
         print(f"{len(returns)} episodes under {under}: mean return {sum(returns) / len(returns):.4f}")
@@ -90,12 +85,14 @@ def play(
         film: File to write (animated WebP): each agent's first episode as it sees it.
         workers: Worker processes; 0 uses every core.
     """
+    from finetune.export import play_agents
+
     if film:
         refuse_inside(film)
         refuse_no_folder(film.parent)
         if film.is_dir():
             raise UserError(f"{film}: is a folder; name a file for the film")
-    cards, played = exporting.play_agents(agents, episodes, workers)
+    cards, played = play_agents(agents, episodes, workers)
     under = cards[0]["corruption"]["corruption"]
     print(f"{episodes} episodes of {cards[0]['task']} under {under}: mean return [95% t interval over episodes]")
     returns = [np.array([episode.total for episode in one])[:, None] for one in played]
@@ -107,5 +104,7 @@ def play(
         low, high = mean_interval(values) or (None, None)
         print(f"  {name:<38} {with_interval(values.mean(), low, high, 0)}")
     if film:
-        write_bytes(film, films.side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
+        from vd4rl_pomdp.report.films import side_by_side
+
+        write_bytes(film, side_by_side(names, [one[0].film for one in played if one[0].film is not None]))
         print(f"film: {film}")

@@ -4,31 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.sweeps.grid import load_grid, narrow
-
-if TYPE_CHECKING:
-    from finetune import evaluation
-    from vd4rl_pomdp.report import compare as comparing
-    from vd4rl_pomdp.report import load, page
-    from vd4rl_pomdp.runs import results
-    from vd4rl_pomdp.studies import certify as certifying
-    from vd4rl_pomdp.sweeps import members
-else:
-    evaluation = Later("finetune.evaluation")
-    comparing = Later("vd4rl_pomdp.report.compare")
-    load = Later("vd4rl_pomdp.report.load")
-    page = Later("vd4rl_pomdp.report.page")
-    results = Later("vd4rl_pomdp.runs.results")
-    certifying = Later("vd4rl_pomdp.studies.certify")
-    members = Later("vd4rl_pomdp.sweeps.members")
 
 
 @command
@@ -51,9 +33,12 @@ def report(
         only: Report only grid cells with these values: method=mik+a,acro seed=0.
         change: Overrides that the grid was run with: preset=cpu finetune.updates=20000.
     """
+    from vd4rl_pomdp.report import load, page
+    from vd4rl_pomdp.sweeps.members import GridMembers
+
     choice = load.ALL
     if grid:
-        choice = members.GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
+        choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
     elif only or change:
         raise UserError("--only and --change apply to the cells of a grid: add --grid")
     written = page.write_report(runs, out, choice)
@@ -72,6 +57,8 @@ def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: P
         b: The same, to compare with.
         out: Also write an HTML page, CSV and LaTeX into this folder.
     """
+    from vd4rl_pomdp.report import compare as comparing
+
     if out is not None:
         refuse_foreign(out, "comparison", f"{comparing.FILE}.csv")
     comparison = comparing.compare_results(a, b)
@@ -91,7 +78,9 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
         runs: One or more run folders, results folders, or folders that contain some.
         out: The results folder; created if missing.
     """
-    print(f"{out}: {results.add_results(runs, out)}")
+    from vd4rl_pomdp.runs.results import add_results
+
+    print(f"{out}: {add_results(runs, out)}")
 
 
 @command
@@ -102,10 +91,15 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
         folder: The results folder.
         replay: Folder of a run with encoder and policy; the first episode of its last evaluation is replayed.
     """
-    runs, wrong = results.verify_results(folder)
-    wrong += certifying.contradictions(folder)
+    from vd4rl_pomdp.runs.results import verify_results
+    from vd4rl_pomdp.studies.certify import contradictions
+
+    runs, wrong = verify_results(folder)
+    wrong += contradictions(folder)
     print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
     if replay is not None:
+        from finetune import evaluation  # loads OpenGL
+
         row, now, where = evaluation.replay(replay, runs)
         print(f"episode 0 under {row['evaluated_under']} replays to a return of {now['return']}")
         differ = [

@@ -5,33 +5,14 @@ from __future__ import annotations
 import json as json_library
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import refuse_no_folder
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_kept
 from vd4rl_pomdp.sweeps.options import LocalOptions, own_program, refuse_unknown_to_jobs
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.bench import gpu as on_gpu
-    from vd4rl_pomdp.bench import suite
-    from vd4rl_pomdp.report import theory as theory_page
-    from vd4rl_pomdp.runs import results as results_folder
-    from vd4rl_pomdp.studies import certify as certificates
-    from vd4rl_pomdp.studies.theory import study as theory_study
-    from vd4rl_pomdp.sweeps import folder as folders
-else:
-    on_gpu = Later("vd4rl_pomdp.bench.gpu")
-    suite = Later("vd4rl_pomdp.bench.suite")
-    theory_page = Later("vd4rl_pomdp.report.theory")
-    results_folder = Later("vd4rl_pomdp.runs.results")
-    certificates = Later("vd4rl_pomdp.studies.certify")
-    theory_study = Later("vd4rl_pomdp.studies.theory.study")
-    folders = Later("vd4rl_pomdp.sweeps.folder")
 
 
 @command
@@ -42,10 +23,13 @@ def theory(json: bool = False, out: Path | None = None) -> None:
         json: Print one JSON object.
         out: Also write the JSON and an HTML page with figures into this folder.
     """
+    from vd4rl_pomdp.report import theory as theory_page
+    from vd4rl_pomdp.studies.theory.study import theory_study
+
     if out is not None:
         refuse_foreign(out, "study of the theory", theory_page.FILE)
         out.mkdir(parents=True, exist_ok=True)  # fail before the computation
-    study = theory_study.theory_study()
+    study = theory_study()
     if json:
         print(json_library.dumps(study))
     else:
@@ -66,6 +50,9 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
             It takes under three minutes.
         device: Training device: auto, cpu or cuda. With --gpu and --quick, cpu tests the code without a GPU.
     """
+    from vd4rl_pomdp.bench import gpu as on_gpu
+    from vd4rl_pomdp.bench import suite
+
     results = on_gpu.gpu_bench(device, quick) if gpu else suite.bench(quick, device)
     if json:
         show(results, as_json=True)
@@ -97,6 +84,10 @@ def certify(
         change: Training settings: seed=0,1,2,3,4 preset=cpu pretrain.patch_size=24 finetune.updates=60000.
         jobs: Concurrent jobs; 0: as many as the GPUs take, or one without a GPU.
     """
+    from vd4rl_pomdp.runs.results import CERTIFICATES, certificate_in_words
+    from vd4rl_pomdp.studies import certify as certificates
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+
     refuse_no_folder(out)
     refuse_kept(out)
     options = LocalOptions(jobs=jobs)
@@ -104,7 +95,7 @@ def certify(
     dataset, cells, trainings = certificates.planned(data, corruption, out, returns, change)
     for training in trainings:
         refuse_unknown_to_jobs(training.settings)
-    folder = folders.SweepFolder(out)
+    folder = SweepFolder(out)
     carry_out([folder.keep_plan(certificates.GRID, trainings, own_program())], folder, "local", options)
-    print(f"{corruption}: {results_folder.certificate_in_words(certificates.certify(dataset, cells, out, returns))}")
-    print(f"certificate: {out / results_folder.CERTIFICATES}")
+    print(f"{corruption}: {certificate_in_words(certificates.certify(dataset, cells, out, returns))}")
+    print(f"certificate: {out / CERTIFICATES}")

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.later import Later
 from vd4rl_pomdp.cli.parsing import command, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
@@ -29,15 +28,8 @@ from vd4rl_pomdp.sweeps.options import (
 )
 
 if TYPE_CHECKING:
-    from vd4rl_pomdp.sweeps import clusters, driver, stages
-    from vd4rl_pomdp.sweeps import folder as folders
-    from vd4rl_pomdp.sweeps import plan as planning
-else:
-    clusters = Later("vd4rl_pomdp.sweeps.clusters")
-    driver = Later("vd4rl_pomdp.sweeps.driver")
-    stages = Later("vd4rl_pomdp.sweeps.stages")
-    folders = Later("vd4rl_pomdp.sweeps.folder")
-    planning = Later("vd4rl_pomdp.sweeps.plan")
+    from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
+    from vd4rl_pomdp.sweeps.plan import Job
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,9 +82,13 @@ def run(words: list[str], program: str) -> None:
         if flag_of(name) in (word.partition("=")[0] for word in words):
             raise UserError(f"{flag_of(name)} is a setting of the grid's trainings: change it by --change {name}=VALUE")
     config = parse_stage(RunCommand, words, program)
+    from vd4rl_pomdp.sweeps import folder as folders  # after --help, which needs no torch
+    from vd4rl_pomdp.sweeps import plan as planning
+    from vd4rl_pomdp.sweeps.stages import check_cells
+
     grid = load_grid(config.grid, config.change, config.testing)
     cells = narrow(grid.cells(), config.only)
-    stages.check_cells(cells, config.grid)
+    check_cells(cells, config.grid)
     # Check before planning, which may decode datasets for minutes.
     for place in (config.out, config.data or config.out):
         refuse_no_folder(place)
@@ -114,30 +110,36 @@ def run(words: list[str], program: str) -> None:
     carry_out([plan], folder, config.executor, config.options, name)
 
 
-def _print_plan(jobs: list[planning.Job], stack: int) -> None:
+def _print_plan(jobs: list[Job], stack: int) -> None:
     """Print each job as one shell line, shared jobs, and the number of processes."""
+    from vd4rl_pomdp.sweeps.driver import in_stacks
+
     users = Counter(name for job in jobs for name in job.needs)
-    left: list[planning.Job] = []
+    left: list[Job] = []
     for job in jobs:
         state = "done" if job.finished else "resumes" if job.begun else "new"
         print(f"# {job.name}: {state}" + f", for {users[job.name]} jobs" * (users[job.name] > 1))
         if state != "done":
             print(f"{program_name()} {shlex.join(job.words)}")
             left.append(job)
-    processes = len(driver.in_stacks(left, stack, {}))
+    processes = len(in_stacks(left, stack, {}))
     packed = f" in at least {processes} processes" if processes < len(left) else ""
     print(f"# {len(jobs)} jobs, {len(jobs) - len(left)} done, {len(left)} to do{packed}")
 
 
-def carry_out(plans: list[folders.Plan], folder: folders.SweepFolder, kind: str, options: Any, name: str = "") -> None:
+def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
     """Run plans to their end by an executor and its options; SystemExit 1 if some jobs are not finished.
 
     `name` is the plan's, empty for all plans in the folder.
     """
+    from vd4rl_pomdp.sweeps import clusters
+    from vd4rl_pomdp.sweeps import folder as folders
+    from vd4rl_pomdp.sweeps.driver import Driver
+
     if JOB_VARIABLE in os.environ:
         raise UserError("a job cannot start a sweep: end the file in `main()`, which reads the job's own command line")
     if kind == "local":
-        finished = driver.Driver(plans, options, folder).run()
+        finished = Driver(plans, options, folder).run()
     else:
         place = folder.path / kind
         cluster = (
@@ -166,6 +168,8 @@ def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
         out: Folder of the sweep.
         json: Print one JSON object.
     """
+    from vd4rl_pomdp.sweeps import folder as folders
+
     folder = folders.SweepFolder(out)
     jobs = folders.jobs_of(folder.plans())
     found = folders.status(jobs, folder.attempts(jobs))
@@ -186,6 +190,8 @@ class RetryCommand(_ExecutorConfig):
 def retry(words: list[str], program: str) -> None:
     """Retry failed jobs."""
     config = parse_stage(RetryCommand, words, program)
+    from vd4rl_pomdp.sweeps import folder as folders  # after --help, as in `run`
+
     folder = folders.SweepFolder(config.out)
     plans = folder.plans_to_do()
     # Append a row instead of deleting some: other drivers may be reading the file.
@@ -216,10 +222,13 @@ def join(
         threads: CPU threads per job; 0: OMP_NUM_THREADS if it is set, else its share of the cores.
         stack: Maximum fine-tunings that one process trains as a stack, in the place of one job.
     """
+    from vd4rl_pomdp.sweeps.driver import Driver
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+
     options = LocalOptions(jobs, jobs_per_gpu, threads, stack)
     options.check()
-    folder = folders.SweepFolder(out)
-    finished = driver.Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
+    folder = SweepFolder(out)
+    finished = Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
     print("all jobs are finished" if finished else "no job can start now; `sweep status` shows what is left")
     if not finished:
         sys.exit(1)
