@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -159,52 +160,35 @@ def test_folder_on_a_read_only_disk_counts_as_in_use(tmp_path, monkeypatch):
     assert in_use(fill(tmp_path / "run", __lock=""))
 
 
-def test_built_folder_appears_complete_and_keeps_hidden_files(tmp_path):
-    out = fill(tmp_path / "out", __DS_Store="of a file manager")
-    with built(out) as made:
+def build(place: Path, meanwhile: Callable[[], object] = lambda: None) -> None:
+    with built(place) as made:
         fill(made, a="1")
-        assert [path.name for path in out.iterdir()] == [".DS_Store"]
-    assert sorted(path.name for path in out.iterdir()) == [".DS_Store", "a"]
+        assert not place.exists() or not list(place.iterdir())
+        meanwhile()
 
+
+def test_built_folder_appears_complete_or_not_at_all(tmp_path):
     def fail() -> None:
-        with built(tmp_path / "deep" / "other") as made:
-            fill(made, a="1")
-            raise UserError("no")
+        raise UserError("no")
 
     with pytest.raises(UserError, match="no"):
-        fail()
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        build(tmp_path / "deep" / "out", fail)
+    assert list(tmp_path.iterdir()) == []
+    build(tmp_path / "new")
+    assert [path.name for path in tmp_path.rglob("*")] == ["new", "a"]
+    hidden = fill(tmp_path / "hidden", __DS_Store="of a file manager")
+    with pytest.raises(UserError, match="hidden: is not empty; choose another --out"):
+        build(hidden)
 
 
-def test_built_folder_may_be_a_link_and_loses_no_hidden_file(tmp_path, monkeypatch):
-    out = fill(tmp_path / "out", __DS_Store="of a file manager")
-    (tmp_path / "link").symlink_to(out)
-    rename = Path.rename
-
-    def broken(self: Path, target: Path) -> Path:
-        if self.name == "new":
-            raise OSError(errno.EIO, "Input/output error")
-        return rename(self, target)
-
-    def build() -> None:
-        with built(tmp_path / "link") as made:
-            fill(made, a="1")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", broken)
-        with pytest.raises(UserError, match="input/output error"):
-            build()
-    assert [path.name for path in out.iterdir()] == [".DS_Store"]
-    build()
-    assert sorted(path.name for path in out.iterdir()) == [".DS_Store", "a"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "out"]
-    fill(tmp_path / "busy")
-
-    def fill_meanwhile() -> None:
-        with built(tmp_path / "busy") as made:
-            fill(made, a="1")
-            (tmp_path / "busy" / "b").write_text("2")
-
-    with pytest.raises(UserError, match="busy: is no longer empty"):
-        fill_meanwhile()
-    assert [path.name for path in (tmp_path / "busy").iterdir()] == ["b"]
+def test_built_folder_may_be_a_link_and_replaces_nothing(tmp_path):
+    out, link = fill(tmp_path / "deep" / "out"), tmp_path / "link"
+    link.symlink_to(out)
+    with pytest.raises(UserError, match=r"link: cannot be used \(directory not empty\)"):
+        build(link, (out / "b").touch)
+    assert [path.name for path in out.iterdir()] == ["b"]
+    (out / "b").unlink()
+    build(link)
+    assert [path.name for path in out.iterdir()] == ["a"]
+    assert link.is_symlink()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "deep", "link", "out"]

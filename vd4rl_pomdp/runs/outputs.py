@@ -130,34 +130,24 @@ def built(out: Path) -> Iterator[Path]:
     """Yield the absolute path of a folder to create, which becomes `out` at the end: `out` is never incomplete.
 
     It lies in a hidden folder next to `out`, locked against other processes. If the block fails, nothing remains; what
-    a killed process leaves is replaced by the next one. `out` may exist if it holds nothing but hidden files; else
-    UserError.
+    a killed process leaves is replaced by the next one. UserError unless `out` is missing or empty.
     """
     refuse_inside(out)
     refuse_no_folder(out)
     absolute = Path(os.path.realpath(out))  # a link stays one
-    if holds_anything(out) or os.path.ismount(absolute):
-        raise UserError(f"{out}: is {'not empty' if holds_anything(out) else 'a mount point'}; choose another --out")
+    with disk_errors(out):
+        if absolute.is_dir() and os.listdir(absolute):
+            raise UserError(f"{out}: is not empty; choose another --out")
     hidden = absolute.with_name(f".{absolute.name}.export")
-    made, before = hidden / "new", hidden / "before"
+    made = hidden / "new"
     with removing_if_empty(hidden, True), owned(hidden):
         shutil.rmtree(made, ignore_errors=True)
         try:
             yield made
-            if holds_anything(out):
-                raise UserError(f"{out}: is no longer empty; choose another --out")
             with disk_errors(out):
-                if absolute.is_dir():
-                    absolute.rename(before)
-                made.rename(absolute)
-                for kept in before.iterdir() if before.is_dir() else ():
-                    kept.rename(absolute / kept.name)
+                made.rename(absolute)  # replaces an empty folder, no other
         finally:
             shutil.rmtree(made, ignore_errors=True)
-            with suppress(OSError):
-                before.rename(absolute)  # fails if the new folder is there
-            with suppress(OSError):
-                before.rmdir()
 
 
 def in_use(folder: Path) -> bool:
