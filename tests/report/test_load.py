@@ -243,37 +243,22 @@ def test_seeds_on_one_encoder_do_not_pool(tmp_path):
     assert pooled(tmp_path / "runs" / "expert-0-2") == {"acro, pretraining seed 0": 1}
 
 
-def test_gaps_include_ablations_but_not_budgets_per_task(tmp_path):
-    runs = tmp_path / "runs"
-    for k in (1, 15):
-        describe(write_run(runs / f"expert{k}", "mik+a", 0, {10: [1.0]}), {"max_k": k})
-    describe(write_run(runs / "medium", "mik+a", 0, {10: [1.0]}, labels={"quality": "medium"}), {"max_k": 15})
-    for quality, steps in (("expert", 20), ("medium", 60)):
-        run = write_run(runs / f"{quality}-acro", "acro", 0, {10: [1.0]}, labels={"quality": quality})
-        describe(run, {"steps": steps})
-    describe(write_run(runs / "none", "random", 0, {10: [1.0]}, labels={"corruption": "none"}), {"steps": 20})
-    for size in (16, 48):
-        run = write_run(runs / f"patch{size}", "random", 0, {10: [1.0]})
-        describe(run, {"patch_size": size}, data=f"f{size}")
-    names = ("quality", "corruption", "method", "variant")
-    variants = [("mik+a", "max_k 1"), ("mik+a", "max_k 15"), ("acro", "steps 20"), ("acro", "steps 60")]
-    assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([runs]))} == {
-        ("medium", "patch, patch_size 16", "mik+a", "max_k 1"),
-        ("medium", "patch, patch_size 16", "random", ""),
-        *(("expert", "patch, patch_size 48", *variant) for variant in variants),
-        *(("expert", "none", *variant) for variant in variants),
-    }
-
-
-def test_state_reference_is_missing_once_per_set(tmp_path):
-    for method, quality, corruption in (
-        *(("acro", quality, corruption) for quality in ("expert", "medium") for corruption in ("none", "patch")),
-        ("state", "expert", "none"),
-    ):
-        labels = {"quality": quality, "corruption": corruption}
-        describe(write_run(tmp_path / f"{method}-{quality}-{corruption}", method, 0, {10: [1.0]}, labels=labels), {})
-    names = ("quality", "corruption", "method")
+def test_gaps_are_seeds_that_other_conditions_of_the_setting_have(tmp_path):
+    made = [
+        ("mik+a", 15, "expert", 0),
+        ("mik+a", 15, "expert", 1),
+        ("mik+a", 1, "expert", 1),
+        ("acro", 15, "expert", 2),
+    ]
+    made += [("mik+a", 15, "medium", 0), ("acro", 15, "medium", 0), ("random", 15, "mixed", 0)]
+    for method, k, quality, seed in made:
+        run = write_run(
+            tmp_path / f"{method}{k}{quality}{seed}", method, seed, {10: [1.0]}, labels={"quality": quality}
+        )
+        describe(run, {"max_k": k})
+    names = ("quality", "method", "variant", "seed", "state")
     assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([tmp_path]))} == {
-        ("medium", "none", "state"),
-        ("medium", "patch", "state"),
+        ("expert", "mik+a", "max_k 15", 2, "missing"),
+        *(("expert", "mik+a", "max_k 1", seed, "missing") for seed in (0, 2)),
+        *(("expert", "acro", "", seed, "missing") for seed in (0, 1)),
     }

@@ -122,23 +122,21 @@ def test_ablations_are_separate_rows(tmp_path):
         assert {row["variant"] for row in table(tmp_path / "out" / f"{name}.csv")} == {"max_k 1", "max_k 15"}
 
 
-def test_missing_cells_and_seeds_are_shown(tmp_path):
-    page, summary, *_ = write_report([grid(tmp_path)], tmp_path / "out")
-    found = summary.set_index(["quality", "method"])[["score", "missing"]].fillna(-1.0).T.to_dict("list")
+def test_missing_seeds_are_shown(tmp_path):
+    _, summary, *_ = write_report([grid(tmp_path)], tmp_path / "out")
+    found = summary.set_index(["quality", "method"])[["score", "missing"]].T.to_dict("list")
     assert found == {
         ("expert", "acro"): [21.0, ""],
         ("expert", "mik+a"): [20.5, "seed 2 missing"],
         ("medium", "acro"): [9.0, ""],
-        ("medium", "mik+a"): [-1.0, "seed 0 missing"],
     }
-    assert cells(page, "<h3>walker_walk medium")[1] == ["mik+a", "–", "–", "–", "–", "0", "0", "seed 0 missing"]
     missing = [(row["quality"], row["seed"], row["state"]) for row in table(tmp_path / "out" / "missing.csv")]
-    assert missing == [("expert", "2", "missing"), ("medium", "0", "missing")]
+    assert missing == [("expert", "2", "missing")]
     states = {
         (row["quality"], row["method"], row["seed"]): row["state"] for row in table(tmp_path / "out" / "runs.csv")
     }
     gone = {place for place, state in states.items() if state == "missing"}
-    assert (len(states), gone) == (8, {("expert", "mik+a", "2"), ("medium", "mik+a", "0")})
+    assert (len(states), gone) == (7, {("expert", "mik+a", "2")})
 
 
 def test_unfinished_and_diverged_runs_are_listed_without_final_scores(tmp_path, drawn):
@@ -403,11 +401,12 @@ def test_differing_data_and_code_are_reported(tmp_path, capsys):
 
 def test_tables_fit_eighty_columns(tmp_path):
     runs = tmp_path / "runs"
-    write_seeds(runs, {("mik+a", "patch"): (50.0, 60.0, 55.0), ("acro", "patch"): (10.0, 12.0, 11.0)}, 600)
+    scores = {("mik+a", "patch"): (50.0, 60.0, 55.0), ("acro", "patch"): (10.0, 12.0, 11.0, 9.0, 8.0, 7.0)}
+    write_seeds(runs, scores, 600)
     write_seeds(runs, {("mik+a", "none"): (70.0, 71.0, 72.0)}, 600, random_histories=0.5)
     shown = io.StringIO()
     print_summary(write_report([runs], tmp_path / "out"), Console(file=shown, width=80))
-    assert "seeds 0, 1, 2" in shown.getvalue(), "the widest column"
+    assert "seeds 3, 4, 5" in shown.getvalue(), "the widest column"
     assert shown.getvalue().count("random_histories") == 2, "once per table"
     borders = [line[-1] for line in shown.getvalue().splitlines() if line[:1] in tuple("┏┃┡│└")]
     assert set(borders) == set("┓┃┩│┘"), "a table wider than the terminal loses its right border"

@@ -7,7 +7,7 @@ settings include those of its encoder, and the data of both stages.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter, itemgetter
@@ -107,8 +107,8 @@ class Run:
     reference: Reference  # what its policy is compared with: data and behaviour policy
     measures: dict[str, float | None]
     """Encoder, critic and cost measures: action_loss, PROBES, CRITIC, COSTS; None if unknown."""
-    parts: tuple[str, str] = ("", "")
-    """What differs among all runs of its method, and how data differ among those in its setting."""
+    variant: str = ""
+    """Settings that distinguish it from other runs of its method: "max_k 1"; empty if none do."""
 
     @property
     def record(self) -> Row:
@@ -125,11 +125,6 @@ class Run:
     @property
     def set_name(self) -> str:
         return f"{self.labels['task']} {self.labels['quality']}"
-
-    @property
-    def variant(self) -> str:
-        """Settings that distinguish it from other runs of its method: "max_k 1"; empty if none do."""
-        return ", ".join(filter(None, self.parts))
 
     @cached_property
     def named(self) -> Row:
@@ -247,7 +242,7 @@ def _load(result: Result) -> Run:
 
 
 def _distinguished(runs: list[Run]) -> list[Run]:
-    """Set each run's `parts`, and append to its corruption the options that differ among runs of that corruption."""
+    """Set each run's `variant`, and append to its corruption the options that differ among runs of that corruption."""
     sets, names = [run.set_name for run in runs], [run.labels["corruption"] for run in runs]
     stages = [(run.stage, run.labels["algorithm"]) for run in runs]
     methods = [(*stage, run.method) for stage, run in zip(stages, runs, strict=True)]
@@ -268,8 +263,8 @@ def _distinguished(runs: list[Run]) -> list[Run]:
                     data[i][DATA[0]] = "one a seed"
     of_data = differences(data, places)
     return [
-        replace(run, labels=run.labels | {"corruption": corruption}, parts=(of_method, of_set))
-        for run, corruption, of_method, of_set in zip(runs, corruptions, of_methods, of_data, strict=True)
+        replace(run, labels=run.labels | {"corruption": corruption}, variant=", ".join(filter(None, parts)))
+        for run, corruption, *parts in zip(runs, corruptions, of_methods, of_data, strict=True)
     ]
 
 
@@ -310,7 +305,7 @@ def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Seque
     Of every run: its settings, its task and quality, and a key; runs of other keys are treated separately. PLAIN
     settings are part of a method's name and stay.
     """
-    # A per-task budget is no ablation. As a variant it would split a method in two, with gaps on every other task.
+    # A per-task budget is no ablation. As a variant it would split a method in two.
     kept = [dict(one) for one in settings]
     for places in groups(range(len(settings)), alike.__getitem__).values():
         table = pd.DataFrame([settings[i] for i in places]).drop(columns=[ENCODER_SEED, *DATA], errors="ignore")
@@ -408,13 +403,13 @@ def runs_frame(runs: Iterable[Run]) -> pd.DataFrame:
 def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
     """One row per missing or unfinished run: CONDITION, seed and `state`.
 
-    In the settings of the report, the policies that the choice wants. If it names none: every method of the report with
-    all its variants, for every seed that any run has in that setting.
+    In the settings of the report, the policies that the choice wants. If it names none: every condition of a setting,
+    for every seed that any run has there.
     """
     policies = sorted(
         (run for run in runs if run.stage == "finetune" and run.labels["task"]), key=attrgetter("evaluated")
     )
-    return _wanted(policies, choice.wanted) if choice.wanted else _inferred(policies)
+    return _wanted(policies, choice.wanted) if choice.wanted else _unpaired(policies)
 
 
 def _wanted(policies: list[Run], wanted: Iterable[Row]) -> list[Row]:
@@ -444,38 +439,20 @@ def _state(run: Run | None) -> str:
     return "not evaluated" if run.finished else run.progress
 
 
-def _inferred(policies: list[Run]) -> list[Row]:
+def _unpaired(policies: list[Run]) -> list[Row]:
     rows = []
-    for place, here in groups(policies, lambda run: run.of(SETTING)).items():
-        there = {run.of((*CONDITION, "seed")): run for run in here}
+    for here in groups(policies, lambda run: run.of(SETTING)).values():
         seeds = sorted({run.labels["seed"] for run in here})
-        for method, mine in groups(policies, lambda run: run.of(("algorithm", "method"))).items():
-            for variant in _expected(mine, place):
+        for condition, mine in groups(here, lambda run: run.of(CONDITION)).items():
+            named = dict(zip(CONDITION, condition, strict=True))
+            runs = {run.labels["seed"]: run for run in mine}
+            for seed in seeds:
+                run = runs.get(seed)
                 # A variant with a shared encoder needs no run for the seed that trained the encoder.
-                own = {seed for seed in seeds if f"{ENCODER_SEED} {seed}" in variant.split(", ")}
-                for seed in (seed for seed in seeds if seed not in own):
-                    run = there.get((*place, *method, variant, seed))
-                    if run is None or not run.evaluated:
-                        named = dict(zip(CONDITION, (*place, *method, variant), strict=True))
-                        rows.append(named | {"seed": seed, "state": _state(run)})
+                shared = f"{ENCODER_SEED} {seed}" in named["variant"].split(", ")
+                if not shared and not (run and run.evaluated):
+                    rows.append(named | {"seed": seed, "state": _state(run)})
     return rows
-
-
-def _expected(mine: list[Run], setting: tuple[str, ...]) -> Iterator[str]:
-    """Variants of a method expected in a setting: all variants of any setting that shares one with it.
-
-    If every setting has its own variants, e.g. a budget per task, nothing is missing. Nor is `state` if it ran on the
-    same dataset under another corruption. Variants by data are expected only where they occur.
-    """
-    by_setting = groups(mine, lambda run: run.of(SETTING))
-    here = by_setting.get(setting, [])
-    if not here and mine[0].method == STATE and any(there[:2] == setting[:2] for there in by_setting):
-        return
-    own = {run.parts[0] for run in here}
-    shared = [there for there in by_setting.values() if not own or own & {run.parts[0] for run in there}]
-    for variant in dict.fromkeys(run.parts[0] for there in shared for run in there):
-        for data in dict.fromkeys(run.parts[1] for run in here if run.parts[0] == variant) or [""]:
-            yield ", ".join(filter(None, (variant, data)))
 
 
 def gaps_in_words(gaps: Iterable[Row]) -> str:
