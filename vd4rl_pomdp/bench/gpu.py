@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
-import statistics
 import tempfile
 import time
 import traceback
@@ -28,7 +27,7 @@ from finetune.features import STAGE, FrozenEncoder, encode_views
 from finetune.histories import Histories
 from pretrain.config import PretrainConfig
 from vd4rl_pomdp.bench.processes import JAX_MISSING, apart, make_trainer
-from vd4rl_pomdp.bench.suite import next_update, on_features, synthetic_set
+from vd4rl_pomdp.bench.suite import next_update, on_features, repeated, seconds_of, synthetic_set
 from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.hardware import pick_device
 from vd4rl_pomdp.core.options import NO_OPTIONS, flat
@@ -144,15 +143,7 @@ def milliseconds(step: Callable[[], Any], device: torch.device, steps: int, bloc
     """Median over blocks of the mean time of a step."""
     for _ in range(_SETTLED if device.type == "cuda" else 1):
         step()
-    times = []
-    for _ in range(blocks):
-        wait(device)
-        start = time.perf_counter()
-        for _ in range(steps):
-            step()
-        wait(device)
-        times.append((time.perf_counter() - start) / steps * 1e3)
-    return statistics.median(times)
+    return seconds_of(repeated(steps, step), blocks) / steps * 1e3
 
 
 def wait(device: torch.device) -> None:

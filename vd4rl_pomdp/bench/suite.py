@@ -363,13 +363,14 @@ def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
         features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
         exact = next_update(config, dataset, encoder.dim, partial(ExactSampler, frozen, NO_OPTIONS, BATCH, 3, 0.99))
         many, few = 20, ALGORITHMS[config.algorithm].period  # a whole period of delayed updates
-        updates = _some(many, on_features(config, dataset, features)), _some(few, exact)
+        updates = repeated(many, on_features(config, dataset, features)), repeated(few, exact)
         fast, slow = alternating(rounds, *updates)
         results |= {f"{kind}_cached_updates_per_s": many / fast, f"{kind}_exact_updates_per_s": few / slow}
         results[f"{kind}_cached_over_exact"] = (slow / few) / (fast / many)
     features = random_features(dataset, 1)
     td3_bc, rebrac = alternating(
-        repeats, *(_some(20, on_features(_small(algorithm=name), dataset, features)) for name in ("td3_bc", "rebrac"))
+        repeats,
+        *(repeated(20, on_features(_small(algorithm=name), dataset, features)) for name in ("td3_bc", "rebrac")),
     )
     return results | {"rebrac_over_td3_bc": rebrac / td3_bc}
 
@@ -387,7 +388,7 @@ def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 10
         (theirs,) = apart("vd4rl_pomdp.bench.processes.jax_updates", shape, updates, repeats)
         precisions = ("fp32", "bf16")
         ours = (_small(hidden_dim=hidden, update_precision=precision) for precision in precisions)
-        seconds = alternating(repeats, *(_some(updates, on_features(config, dataset, features)) for config in ours))
+        seconds = alternating(repeats, *(repeated(updates, on_features(config, dataset, features)) for config in ours))
         for precision, ms in zip(precisions, (1e3 * one / updates for one in seconds), strict=True):
             name = f"units_{hidden}_{precision}"
             results |= {f"{name}_ms": ms, f"{name}_jax_over_ours": theirs["ms"] / ms}
@@ -404,7 +405,7 @@ def _small(**settings: Any) -> FinetuneConfig:
     return FinetuneConfig.of("cpu", batch_size=BATCH, **settings)
 
 
-def _some(count: int, update: Callable[[], Any]) -> Callable[[], None]:
+def repeated(count: int, update: Callable[[], Any]) -> Callable[[], None]:
     """A function that makes several updates."""
 
     def updates() -> None:
