@@ -202,33 +202,22 @@ def retry(words: list[str], program: str) -> None:
 
 
 @command
-def join(
-    out: tyro.conf.Positional[Path],
-    plan: str = "",
-    jobs: int = 0,
-    jobs_per_gpu: int = 1,
-    threads: int = 0,
-    stack: int = 1,
-) -> None:
+def join(out: tyro.conf.Positional[Path], local: LocalOptions, plan: str = "") -> None:
     """Work on a running sweep from this machine: run jobs that no other driver runs, and exit when none are left.
 
     Slurm and Ray tasks do this; on any other cluster, start as many as you like.
 
     Args:
         out: Folder of the sweep.
+        local: Options of the jobs that run here.
         plan: Run only this plan's jobs; default: all plans in OUT/sweep/plans.
-        jobs: Concurrent jobs on this machine; 0: as many as its GPUs take, or one without a GPU.
-        jobs_per_gpu: Concurrent jobs per GPU.
-        threads: CPU threads per job; 0: OMP_NUM_THREADS if it is set, else its share of the cores.
-        stack: Maximum fine-tunings that one process trains as a stack, in the place of one job.
     """
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder
 
-    options = LocalOptions(jobs, jobs_per_gpu, threads, stack)
-    options.check()
+    local.check()
     folder = SweepFolder(out)
-    finished = Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
+    finished = Driver(folder.plans_to_do(plan), local, folder, helps=True).run()
     print("all jobs are finished" if finished else "no job can start now; `sweep status` shows what is left")
     if not finished:
         sys.exit(1)
