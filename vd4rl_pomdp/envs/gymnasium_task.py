@@ -19,8 +19,6 @@ from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork,
 from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep, between, check_bounds
 
 NOTHING = np.zeros(0)
-MOST_STEPS_A_SECOND = 1000
-_NUMBERS = (int, float, np.number)
 _REFUSALS = (gymnasium.error.Error, ImportError)
 """Errors by which an environment reports that it cannot run, for example without a package."""
 
@@ -78,23 +76,8 @@ class GymnasiumEnv(PixelEnv):
 
     @property
     def rate(self) -> float:
-        """Decisions per second of simulated time.
-
-        From the environment's `dt` or dm_control's `control_timestep()`, else from its metadata's `render_fps`, which
-        is a playback rate (shimmy's is not the true one), else 30.
-        """
-        for name in ("dt", "control_timestep"):
-            step = getattr(self.env.unwrapped, name, None)
-            step = step() if callable(step) else step
-            if isinstance(step, _NUMBERS) and step > 0:
-                return 1 / float(step) / self.task.action_repeat
-        rate = self.env.metadata.get("render_fps", 30)
-        if not (isinstance(rate, _NUMBERS) and 1 <= rate <= MOST_STEPS_A_SECOND):
-            raise UserError(
-                f"environment {self._name} has the render_fps {rate!r} in its metadata: correct it to the steps "
-                f"per second of simulated time, 1 to {MOST_STEPS_A_SECOND}, or give the environment a `dt` in seconds"
-            )
-        return float(rate) / self.task.action_repeat
+        """Decisions per second by the environment's `render_fps`, else by 30."""
+        return (self.env.metadata.get("render_fps") or 30) / self.task.action_repeat
 
     def close(self) -> None:
         self.env.close()
