@@ -146,7 +146,7 @@ def test_clip_uses_its_vision_model_and_statistics(tmp_path: Path):
     torch.testing.assert_close(frame.convolutions(image.repeat(1, 3, 1, 1) - 0.5).view(3, 16), expected.expand(3, 16))
 
 
-def test_random_features_and_unsupported_sizes_are_rejected(tmp_path: Path):
+def test_random_features_and_unsupported_sizes_are_rejected(tmp_path: Path, monkeypatch):
     transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
     transformers.ViTMAEModel(transformers.ViTMAEConfig(**SHAPE)).save_pretrained(tmp_path / "mae")
     with pytest.raises(UserError, match="its features of one image differ between calls"):
@@ -154,6 +154,9 @@ def test_random_features_and_unsupported_sizes_are_rejected(tmp_path: Path):
     transformers.ViTModel(transformers.ViTConfig(**SHAPE)).save_pretrained(tmp_path / "vit")
     with pytest.raises(UserError, match=r"cannot encode images of 56x56 pixels \(Input image size .* --model-size"):
         make("pretrained", model=str(tmp_path / "vit"), model_size=56)
+    monkeypatch.setattr(transformers.ViTModel, "forward", MagicMock(side_effect=AssertionError("Input height")))
+    with pytest.raises(UserError, match=r"cannot encode images of 28x28 pixels \(Input height\)"):  # as timm refuses
+        make("pretrained", model=str(tmp_path / "vit"), model_size=SIZE)
 
 
 def test_missing_transformers_is_reported(monkeypatch, tmp_path):

@@ -42,8 +42,8 @@ class Pretrained(nn.Module):
 
         Raises:
             UserError: transformers or the model is missing, its weights differ or are incomplete, it cannot encode
-                images of this size, is random, or ignores their border (only where any weights may be loaded), or
-                channels is not a multiple of 3.
+                images of this size, is random, or has patches that do not fill them (only where any weights may be
+                loaded), or channels is not a multiple of 3.
         """
         super().__init__()
         if channels % 3:
@@ -61,19 +61,23 @@ class Pretrained(nn.Module):
         self.size, self.found = size, {"weights": found}
         self.register_buffer("mean", mean, persistent=False)
         self.register_buffer("std", std, persistent=False)
-        ramp = torch.linspace(-0.5, 0.5, channels * size * size).view(1, channels, size, size).requires_grad_()
+        ramp = torch.linspace(-0.5, 0.5, channels * size * size).view(1, channels, size, size)
         try:
-            with torch.enable_grad():
-                first, again = self(ramp), self(ramp)
-        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            first, again = self(ramp), self(ramp)
+        except Exception as error:  # a model raises anything, such as assertions of timm
             raise UserError(
                 f"--model {name}: cannot encode images of {size}x{size} pixels ({first_line(error)}): choose another "
                 "--model-size or --model"
             ) from error
         if not torch.equal(first, again):  # such as MAE, which masks patches at random
             raise UserError(f"--model {name}: its features of one image differ between calls: choose another model")
-        if not weights:  # an encoder that was trained on what the model sees stays usable
-            _check_border(name, ramp, first)
+        patch = getattr(model.config, "patch_size", None)
+        # not if its weights are given: an encoder that was trained on what the model sees stays usable
+        if not weights and isinstance(patch, int) and size % patch:
+            raise UserError(
+                f"--model {name}: ignores the last rows and columns of images of {size}x{size} pixels: choose a "
+                "--model-size that is a multiple of the model's patch size"
+            )
 
     def forward(self, image: Tensor) -> Tensor:
         frames = F.interpolate(image.unflatten(1, (-1, 3)).flatten(0, 1), (self.size, self.size), mode="bilinear")
@@ -130,17 +134,6 @@ def _statistics(name: str) -> tuple[Tensor, Tensor]:
         stated = read_json(Path(cached_file(name, "preprocessor_config.json", local_files_only=True)))
     mean, std = stated.get("image_mean", MEAN), stated.get("image_std", STD)
     return torch.tensor(mean).expand(3)[:, None, None], torch.tensor(std).expand(3)[:, None, None]
-
-
-def _check_border(name: str, images: Tensor, features: Tensor) -> None:
-    """Refuse a model that drops the last rows and columns, as ViTs do with those that fill no whole patch."""
-    (gradient,) = torch.autograd.grad(features.flatten().dot(torch.linspace(-1, 1, features.numel())), images)
-    if not (gradient[..., -1, :].any() and gradient[..., :, -1].any()):
-        size = images.shape[-1]
-        raise UserError(
-            f"--model {name}: ignores the last rows and columns of images of {size}x{size} pixels: choose a "
-            "--model-size that is a multiple of the model's patch size"
-        )
 
 
 def _content(tensors: Mapping[str, Tensor]) -> str:
