@@ -192,13 +192,11 @@ def test_messages_are_escaped_on_ascii_terminals():
 
 
 def test_printed_results_take_one_line_each(capsys):
-    show(
-        {"shards": [f"{i}.hdf5" for i in range(100)], "dtypes": {"reward": ["float64"]}, "seconds": 0.123456789}, False
-    )
+    show({"shards": [f"{i}.hdf5" for i in range(100)], "render": {"mujoco": ["3.11.0"]}, "seconds": 0.123456789}, False)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines == [
         ["shards", "0.hdf5", "...", "99.hdf5", "(100)"],
-        ["dtypes.reward", "float64"],
+        ["render.mujoco", "3.11.0"],
         ["seconds", "0.123457"],
     ]
 

@@ -8,7 +8,7 @@ import pytest
 from tests.helpers_data import fake_rows, read_shard, write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.folder import shard_paths
-from vd4rl_pomdp.data.format import read_attributes, read_dtypes, read_frames, write_shard
+from vd4rl_pomdp.data.format import read_attributes, read_frames, write_shard
 
 
 @pytest.fixture
@@ -201,9 +201,8 @@ def test_null_dataset_counts_as_missing(shard, key):
     with h5py.File(shard, "a") as file:
         file.pop(key, None)
         file.create_dataset(key, data=h5py.Empty("f8"))
-    for read in (read_shard, read_dtypes):
-        with pytest.raises(UserError, match=f"has no '{key}'"):
-            read(shard)
+    with pytest.raises(UserError, match=f"has no '{key}'"):
+        read_shard(shard)
 
 
 @pytest.mark.parametrize("stored", ["[1]", "{", 5, '{"task": ' + "[" * 100_000])
@@ -232,6 +231,5 @@ def test_arrays_in_other_files_are_rejected(shard, tmp_path, kind):
             layout = h5py.VirtualLayout(value.shape, value.dtype)
             layout[...] = h5py.VirtualSource(other["reward"])
             file.create_virtual_dataset("reward", layout)
-    for read in (read_shard, read_dtypes):
-        with pytest.raises(UserError, match="'reward' is stored in another file"):
-            read(shard)
+    with pytest.raises(UserError, match="'reward' is stored in another file"):
+        read_shard(shard)

@@ -12,7 +12,6 @@ import numpy as np
 from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
-from vd4rl_pomdp.data.format import read_dtypes
 from vd4rl_pomdp.data.store import verify_store
 from vd4rl_pomdp.envs.mazes import MAZES
 
@@ -25,20 +24,16 @@ def check_dataset(path: Path | str, cache: Path | None = None) -> dict[str, Any]
         training), `action_dim`, `return_mean`, `return_min` and `return_max` over all episodes, incomplete ones
         included, `replay_max_error` (largest absolute difference between stored and replayed rewards, or states in a
         maze; None if replay is impossible), `replay` (what was replayed, or why not), `frame_size`, `task`, `quality`,
-        `shards` (names in order), `dtypes` (stored dtypes by key), `store_ok` (True: the cached files match their
-        checksums).
+        `shards` (names in order).
 
     Raises:
         UserError: the data set or its cached form is damaged.
     """
-    path = Path(path)
     dataset = open_dataset(path, cache)
     verify_store(dataset.store)
     _check_actions(dataset)
     returns = dataset.returns.numpy()
     replayed, reason = _replayed(dataset)
-    shards = [path] if path.is_file() else [path / name for name in dataset.store.meta["shards"]]
-    dtypes = [read_dtypes(shard) for shard in shards]
     return {
         "rows": dataset.num_rows,
         "episodes": dataset.num_episodes,
@@ -55,8 +50,6 @@ def check_dataset(path: Path | str, cache: Path | None = None) -> dict[str, Any]
         "task": dataset.task,
         "quality": dataset.quality,
         "shards": dataset.store.meta["shards"],
-        "dtypes": {key: sorted({stored[key] for stored in dtypes}) for key in dtypes[0]},
-        "store_ok": True,
     }
 
 

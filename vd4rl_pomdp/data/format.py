@@ -65,12 +65,6 @@ def read_attributes(path: Path) -> dict[str, Any]:
         return attributes
 
 
-def read_dtypes(path: Path) -> dict[str, str]:
-    """Stored dtype of every key of a shard."""
-    with _open(path) as file:
-        return {key: str(file[key].dtype) for key in _keys(path, file)}
-
-
 def read_frame_size(shards: Sequence[Path]) -> int:
     """Height and width S of a data set's frames; UserError for another shape or dtype, or for two sizes."""
     low, high = FRAME_SIZES
