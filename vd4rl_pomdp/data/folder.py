@@ -228,12 +228,6 @@ def _check_episodes(shards: Sequence[Path], counts: Sequence[int], step_type: np
     strays = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
     if len(strays):
         fail(int(strays[0]), "follows an episode's last row without beginning a new one")
-    for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
-        (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
-        # without numbers, shards are assumed to be consecutive
-        adjacent = -1 in (before, number) or (rest == previous_rest and number == before + 1)
-        if step_type[row] != StepType.FIRST and not adjacent:
-            fail(int(row), f"continues an episode, but not that of {previous.name}")
 
 
 def check_count(path: Path, episodes: int) -> None:
