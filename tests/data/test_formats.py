@@ -245,19 +245,6 @@ def test_import_of_damaged_episode_leaves_nothing(changed, message, tmp_path):
     assert list((tmp_path / "empty").iterdir()) == [], "the user's existing folder stays"
 
 
-def test_import_beside_another_import_leaves_its_plan(tmp_path, monkeypatch):
-    export_set("vd4rl_npz", write_fake_set(tmp_path / "own", [5, 5]), tmp_path / "npz")
-
-    def in_use(out: Path, *_: object) -> None:
-        out.mkdir()
-        (out / "collection.json").write_text("{}")  # the other import's, which began in the meantime
-        raise UserError("is in use")
-
-    monkeypatch.setattr("vd4rl_pomdp.data.transfer.collect_set", in_use)
-    rejection(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "new")])
-    assert (tmp_path / "new" / "collection.json").exists()
-
-
 def test_minari_export_notes_losses(minari, tmp_path, capsys):
     episodes = [fake_episode(0, 5), fake_episode(1, 1), fake_episode(2, 5)]
     episodes[0]["discount"][2], episodes[1]["step_type"][0] = 0.5, StepType.FIRST

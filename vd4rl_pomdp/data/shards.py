@@ -72,18 +72,23 @@ def collect_set(
         code = {name: parts for name, parts in code_of(settings).items() if parts}
         write_json(out / PLAN, settings | code | {"rendered_by": rendered})
         started, frames = time.monotonic(), 0
-        with ProgressLine(title[0], sum(len(shard.jobs) for shard in missing), title[1]) as progress:
-            for shard in missing:
-                rollouts = []
-                for rollout in run_jobs(roll_out, shard.jobs, workers):
-                    rollouts.append(rollout)
-                    frames += len(rollout["reward"])
-                    speed = frames / (time.monotonic() - started)
-                    progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
-                rows = {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
-                del rollouts, rollout  # else they stay in memory beside `rows`, and `rows` beside the next shard's
-                write_shard(shard.path, rows, shard.attributes)
-                del rows
+        try:
+            with ProgressLine(title[0], sum(len(shard.jobs) for shard in missing), title[1]) as progress:
+                for shard in missing:
+                    rollouts = []
+                    for rollout in run_jobs(roll_out, shard.jobs, workers):
+                        rollouts.append(rollout)
+                        frames += len(rollout["reward"])
+                        speed = frames / (time.monotonic() - started)
+                        progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
+                    rows = {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
+                    del rollouts, rollout  # else they stay in memory beside `rows`, and `rows` beside the next shard's
+                    write_shard(shard.path, rows, shard.attributes)
+                    del rows
+        except UserError:
+            if not whole and not any(shard.path.exists() for shard in shards):
+                (out / PLAN).unlink(missing_ok=True)  # nothing was collected: any other command may start here
+            raise
         spent = {"seconds": round(time.monotonic() - started, 1), "frames": frames} if missing else {}  # of this call
         origin = {"command": command(), "git_commit": git_commit(), "versions": versions(), "render": rendered}
         write_json(out / PROVENANCE, spent | {"workers": count_workers(workers)} | origin)

@@ -20,7 +20,6 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, TASKS, DMCTask
 from vd4rl_pomdp.core.types import WINDOW
 from vd4rl_pomdp.data.card import write_card
-from vd4rl_pomdp.data.folder import PLAN, PROVENANCE
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
 from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.data.formats.base import SourceSet
@@ -94,13 +93,7 @@ def import_set(
     ]
     episodes = _Reader(source, opened, clip_actions)
     with removing_if_empty(out):
-        try:
-            collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
-        except UserError:
-            holds = (out / PROVENANCE).exists() or any(shard.path.exists() for shard in shards)
-            if episodes.called and not holds:
-                (out / PLAN).unlink(missing_ok=True)
-            raise
+        collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
     _print(episodes.notes())
     write_card(out)
     return [shard.path for shard in shards]
@@ -160,11 +153,8 @@ class _Reader:
         self._last = np.zeros(0, np.uint8)  # last image of the previous episode
         self._clipped = self._steps = self._followed = self._joined = 0
         self._moved = False
-        self.called = False
-        """Whether this process imports, not another one that owns the folder."""
 
     def __call__(self, number: int) -> EpisodeArrays:
-        self.called = True
         with _errors_of(f"{self._name}: episode {number}"):
             if self._episodes is None:
                 self._episodes = enumerate(self._source.read(number), number)
