@@ -517,6 +517,25 @@ def test_import_holds_two_shards_at_most(tmp_path, monkeypatch):
     assert peak < 2.5 * 200 * 3 * 84**2
 
 
+def test_episodes_longer_than_row_keys_are_rejected(tmp_path, monkeypatch):
+    own = write_fake_set(tmp_path / "own", [20, 25])
+    export_set("vd4rl_npz", own, tmp_path / "npz")
+    monkeypatch.setattr("vd4rl_pomdp.data.folder.MOST_ROWS", 24)
+    with pytest.raises(UserError, match="own: an episode has 25 rows, more than 24"):
+        open_dataset(own, tmp_path / "cache")
+    with pytest.raises(UserError, match="npz: an episode has 25 rows, more than 24"):
+        import_set("vd4rl_npz", str(tmp_path / "npz"), tmp_path / "set")
+    assert not (tmp_path / "set").exists(), "refused before the import"
+
+
+def test_minari_export_needs_space_for_its_images(minari, tmp_path, monkeypatch):
+    folder, need = write_fake_set(tmp_path / "own", [4, 4]), 8 * 3 * 84**2
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("usage", (), {"free": need - 1}))
+    with pytest.raises(UserError, match=r"a-v0: the export needs 169,344 bytes, the disk has 169,343; free some space"):
+        export_set("minari", folder, tmp_path / "a-v0")
+    assert not [path for path in tmp_path.iterdir() if "a-v0" in path.name]
+
+
 def test_short_episodes_are_left_out(tmp_path, own_cache, capsys):
     own = write_fake_set(tmp_path / "own", [20, 5, 25, 1], attributes={"task": "walker_walk"})
     with pytest.raises(UserError, match=r"holds no episodes of 26 or more rows"):

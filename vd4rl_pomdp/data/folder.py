@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import MOST_ROWS, UserError, disk_errors
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows
@@ -191,8 +191,8 @@ def read_set(path: Path) -> StoredSet:
 
     Raises:
         UserError: as by `shard_paths` and `read_rows`; the shards differ in dimensions, keys or frame size; a row
-            neither starts an episode nor continues that of the previous row; or the number of episodes differs from
-            that in collection.json.
+            neither starts an episode nor continues that of the previous row; an episode is too long; or the number of
+            episodes differs from that in collection.json.
     """
     shards = shard_paths(path)
     frame_size, parts = read_frame_size(shards), [read_rows(shard) for shard in shards]
@@ -206,6 +206,7 @@ def read_set(path: Path) -> StoredSet:
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     _check_episodes(shards, counts, rows["step_type"])
     found = StoredSet(shards, frame_size, [read_attributes(shard) for shard in shards], counts, rows)
+    check_lengths(path, found.ends - found.starts)
     check_count(path, len(found.starts))
     return found
 
@@ -228,6 +229,14 @@ def _check_episodes(shards: Sequence[Path], counts: Sequence[int], step_type: np
     strays = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
     if len(strays):
         fail(int(strays[0]), "follows an episode's last row without beginning a new one")
+
+
+def check_lengths(place: Path | str, lengths: Sequence[int] | np.ndarray) -> None:
+    """Raise UserError, naming `place`, for an episode of more rows than row keys can count."""
+    if (most := max(lengths)) > MOST_ROWS:
+        raise UserError(
+            f"{place}: an episode has {most:,} rows, more than {MOST_ROWS:,}; mark where episodes end, or split it"
+        )
 
 
 def check_count(path: Path, episodes: int) -> None:

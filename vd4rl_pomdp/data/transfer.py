@@ -20,6 +20,7 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, TASKS, DMCTask
 from vd4rl_pomdp.core.types import WINDOW
 from vd4rl_pomdp.data.card import write_card
+from vd4rl_pomdp.data.folder import check_lengths
 from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
 from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.data.formats.base import SourceSet
@@ -65,6 +66,7 @@ def import_set(
         numbers = [number for number, rows in enumerate(opened.lengths) if rows >= shortest]
         if not numbers:
             raise UserError(f"holds no episodes of {shortest} or more rows" if opened.lengths else "holds no episodes")
+        check_lengths(source, opened.lengths)
     lengths = [opened.lengths[number] for number in numbers]
     own = next((value for value in opened.record.values() if isinstance(value, str)), name)
     # without a known task, its label (also used in file names) is made from the source's own name

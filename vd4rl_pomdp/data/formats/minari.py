@@ -8,6 +8,7 @@ than actions, with a_t aligned to o_t. Images are written as (3, S, S), which Mi
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.errors import DiskFullError, UserError
 from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import FRAMES_KEY
@@ -118,6 +119,11 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     folder.mkdir()
     # Dimensions come from the first episode. Minari does not treat (3, S, S) as an image, so it is never JPEG-encoded.
     first = next(source.read(0))
+    size, free = sum(source.lengths) * first[FRAMES_KEY][0].nbytes, shutil.disk_usage(folder).free
+    if size > free:  # HDF5 ends the process on a full disk
+        raise DiskFullError(
+            f"{out}: the export needs {size:,} bytes, the disk has {free:,}; free some space, or choose another folder"
+        )
     pictures = gymnasium.spaces.Box(0, 255, first[FRAMES_KEY].shape[1:], np.uint8)
     actions = gymnasium.spaces.Box(-1.0, 1.0, first["action"].shape[1:], np.float32)
     made = storage.MinariStorage.new(folder / "data", pictures, actions)
