@@ -236,6 +236,16 @@ FOREIGN = {
 }
 
 
+def test_pull_refuses_a_mount_point_before_the_download(hub, encoder, tmp_path, monkeypatch):
+    push(encoder, ENCODER)
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setattr("os.path.ismount", lambda path: Path(path) == tmp_path / "disk")
+    with pytest.raises(UserError, match="disk: is a mount point; choose a folder in it"):
+        pull(ENCODER, tmp_path / "disk")
+    assert lists(tmp_path) == ["disk", "run"]
+    assert pull(ENCODER, tmp_path / "disk" / "encoder")
+
+
 @pytest.mark.parametrize("write", FOREIGN.values(), ids=FOREIGN)
 def test_pull_does_not_overwrite_foreign_files(hub, encoder, tmp_path, write):
     push(encoder, ENCODER)

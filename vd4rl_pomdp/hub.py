@@ -117,6 +117,8 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             raise UserError(
                 f"{folder}: is not empty and holds something other than {repository}; choose another folder"
             )
+        if os.path.ismount(folder):  # before the download, after which the folder could not be replaced
+            raise UserError(f"{folder}: is a mount point; choose a folder in it")
         # Next to the folder, so that the final rename is atomic; its fixed name lets the next pull resume.
         api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
     with disk_errors(folder):

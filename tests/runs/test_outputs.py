@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -127,11 +128,23 @@ def test_all_commands_with_out_are_covered(capsys):
 HOLDER = """
 import sys, time
 from pathlib import Path
+from unittest.mock import MagicMock
 from vd4rl_pomdp.runs.outputs import owned
 with owned(Path(sys.argv[1])):
     print("owned", flush=True)
     time.sleep(60)
 """
+
+
+@pytest.mark.filterwarnings("ignore:flock not supported")
+def test_killed_process_on_a_disk_without_locks_leaves_a_named_file(tmp_path, monkeypatch):
+    (tmp_path / ".lock").write_text("process 7 on host")
+    monkeypatch.setattr("fcntl.flock", MagicMock(side_effect=OSError(errno.ENOSYS, "Function not implemented")))
+    with pytest.raises(UserError, match=rf"process 7 on host; wait .*delete {tmp_path}/\.lock"), owned(tmp_path):
+        pass
+    (tmp_path / ".lock").unlink()
+    with owned(tmp_path):
+        pass
 
 
 def test_folder_in_use_names_its_process_until_it_dies(tmp_path):

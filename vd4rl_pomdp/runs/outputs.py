@@ -88,7 +88,9 @@ def _names(folder: Path) -> list[str]:
 
 @contextmanager
 def owned(folder: Path) -> Iterator[None]:
-    """Create and lock a folder, and handle signals as `interrupt` does. The lock of a killed process is released.
+    """Create and lock a folder, and handle signals as `interrupt` does.
+
+    The lock of a killed process is released, unless the folder's disk has no file locks: then its file stays.
 
     UserError if another process, which the message names, owns it, or it cannot be written.
     """
@@ -99,7 +101,10 @@ def owned(folder: Path) -> Iterator[None]:
             lock.acquire(timeout=_WAIT_S, poll_interval=_WAIT_S / 10)
         except Timeout:
             owner = (folder / LOCK).read_text(encoding="utf-8") or "another process"
-            raise UserError(f"{folder}: is in use by {owner}; wait until it ends, or choose another folder") from None
+            raise UserError(
+                f"{folder}: is in use by {owner}; wait until it ends, or choose another folder; if it was killed on a "
+                f"disk without locks, delete {folder / LOCK}"
+            ) from None
     try:
         owner = f"process {os.getpid()} on {socket.gethostname()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S UTC}"
         with disk_errors(folder):
