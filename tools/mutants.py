@@ -23,7 +23,7 @@ LIMIT_S = 600
 
 
 def load_mutants() -> list[dict[str, str]]:
-    """All mutants in order, each with name, file, old, new, claim and test."""
+    """All mutants in order, each with name, file, old, new and test."""
     return [mutant for section in tomllib.loads(LIST.read_text(encoding="utf-8")).values() for mutant in section]
 
 
