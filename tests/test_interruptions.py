@@ -31,6 +31,7 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
+from vd4rl_pomdp.runs.loop import Loop
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
@@ -348,22 +349,27 @@ def test_failed_append_leaves_a_run_unchanged(finetuned, tmp_path):
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])
+@pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2), (2, None)])
 def test_interrupted_evaluation_is_repeated(encoder, finetuned, data, tmp_path, monkeypatch, evaluation, rows_written):
-    """Also in the last evaluation, which includes clean episodes."""
+    """Also in the last evaluation, which includes clean episodes, and after its row of metrics."""
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     append, evaluations = finetune.trainer.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         evaluations.append(rows)
-        if len(evaluations) < evaluation:
+        if len(evaluations) < evaluation or rows_written is None:
             append(path, rows)
             return
         append(path, rows[:rows_written])
         raise KeyboardInterrupt
 
+    def show(self, **shown: float) -> None:
+        if len(evaluations) == evaluation:
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
         patch.setattr(finetune.trainer, "append_episodes", cut)
+        patch.setattr(Loop, "show", show)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     if evaluation == 2:
