@@ -21,13 +21,12 @@ from finetune.features import _ENCODED, FrozenEncoder
 from finetune.train import finetune as run_finetune
 from pretrain.train import Trainer
 from pretrain.train import pretrain as run_pretrain
-from tests.helpers_data import write_fake_set
+from tests.helpers_data import fake_rows, write_fake_set, write_rows
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
@@ -80,21 +79,9 @@ def finetuned(data, encoder, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def maze(tmp_path_factory) -> Path:
     """A maze dataset with random frames."""
-    folder, rng, rows = tmp_path_factory.mktemp("maze"), np.random.default_rng(0), 120
-    step_type = np.tile([0, *[1] * 28, 2], 4)
-    write_shard(
-        folder / "0_three_curtains.hdf5",
-        {
-            "observation": rng.integers(0, 256, (rows, 3, 100, 100), np.uint8),
-            "action": rng.uniform(-1, 1, (rows, 2)),
-            "reward": np.zeros(rows),
-            "discount": np.ones(rows),
-            "step_type": step_type,
-            "physics": rng.normal(size=(rows, 4)),
-        },
-        {"task": "three_curtains"},
-    )
-    return folder
+    rows = fake_rows([30] * 4, action_dim=2, noise=100)
+    rows["physics"] = np.random.default_rng(0).normal(size=(120, 4))
+    return write_rows(tmp_path_factory.mktemp("maze"), rows, {"task": "three_curtains"})
 
 
 Stage = tuple[Callable[[Any], Any], Callable[[Path], Any], Any]

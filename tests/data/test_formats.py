@@ -18,6 +18,7 @@ from tests.helpers_data import (
     fake_episode,
     fake_frame,
     fake_reward,
+    fake_rows,
     rows_of_set,
     write_fake_set,
     write_rows,
@@ -456,9 +457,8 @@ def test_published_64_pixel_sets_print_a_note(tmp_path, capsys):
 
 
 def test_resized_frames_are_area_means(tmp_path, capsys):
-    rows = fake_episode(0, 6)
-    rows["observation"] = np.random.default_rng(0).integers(0, 256, (6, 3, 84, 84), np.uint8)
-    own = str(write_rows(tmp_path / "own", rows, {"task": "walker_walk", "set": "expert"}))
+    attributes = {"task": "walker_walk", "set": "expert"}
+    own = str(write_fake_set(tmp_path / "own", [6], noise=84, attributes=attributes))
     import_set("vd4rl", own, tmp_path / "small", size=50)
     told = capsys.readouterr().err
     assert "images of 84x84 pixels become 50x50 (area means)" in told
@@ -466,7 +466,9 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     import_set("vd4rl", own, tmp_path / "maze", task="elsewhere", size=50)
     assert "evaluations" not in capsys.readouterr().err
     small = rows_of_set(tmp_path / "small")
-    means = [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]
+    means = [
+        area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in fake_rows([6], noise=84)["observation"]
+    ]
     np.testing.assert_array_equal(small["observation"], means)
     assert_equal_rows(rows_of_set(tmp_path / "own"), small, but=["observation"])
 

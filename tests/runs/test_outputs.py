@@ -1,7 +1,6 @@
 """Commands neither overwrite nor write into a run, policy, encoder or dataset, or a folder in use."""
 
 import errno
-import hashlib
 import json
 import os
 import signal
@@ -14,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_data import write_fake_set
+from tests.helpers_data import file_bytes, write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.outputs import built, in_use, kept_in, owned, refuse_foreign, refuse_inside
@@ -38,10 +37,6 @@ def kept(tmp_path) -> dict[str, Path]:
         "a data set": write_fake_set(tmp_path / "walker_walk" / "expert"),
         "a data set ": fill(tmp_path / "collecting", collection__json="{}"),
     }
-
-
-def contents(folder: Path) -> dict[str, str]:
-    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_foreign_config_files_are_no_runs(tmp_path):
@@ -104,12 +99,12 @@ def test_commands_do_not_write_into_owned_folders(name, kept, tmp_path, monkeypa
         if name not in (*FILES, "pretrain", "finetune", "navigation train"):  # these check their data first
             places.append(folder)
         for out in places:
-            before = contents(tmp_path)
+            before = file_bytes(tmp_path)
             words = [*commands(kept["a data set"], kept["a run"])[name], "--out", str(out)]
             error = rejection(words)
             assert str(out) in error
             assert "choose another " in error
-            assert contents(tmp_path) == before
+            assert file_bytes(tmp_path) == before
 
 
 def test_all_commands_with_out_are_covered(capsys):
