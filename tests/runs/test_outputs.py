@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers_bad_input import rejection
+from tests.helpers_bad_input import RUN, SET, VALID, WITHOUT_OUT, rejection
 from tests.helpers_data import file_bytes, write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -31,10 +31,10 @@ def kept(tmp_path) -> dict[str, Path]:
     """One folder of every kind that owns its files."""
     run = {"stage": "finetune", "config": {}, "versions": {}, "git_commit": "", "command": ""}
     return {
-        "a run": fill(tmp_path / "run", config__json=json.dumps(run), episodes__csv=""),
+        "a run": fill(tmp_path / RUN, config__json=json.dumps(run), episodes__csv=""),
         "an encoder": fill(tmp_path / "encoder", config__json="{}", model__safetensors=""),
         "a policy": fill(tmp_path / "policy", config__json='{"task": "cheetah_run"}', curve__csv=""),
-        "a data set": write_fake_set(tmp_path / "walker_walk" / "expert"),
+        "a data set": write_fake_set(tmp_path / SET),
         "a data set ": fill(tmp_path / "collecting", collection__json="{}"),
     }
 
@@ -60,39 +60,14 @@ def test_output_inside_owned_folders_is_rejected(kept, tmp_path):
         refuse_foreign(mine, "report", "summary.csv")
 
 
-def commands(data: Path, run: Path) -> dict[str, list[str]]:
-    """Valid arguments, without --out, of every command that has an --out."""
-    preset = ["--preset", "smoke"]
-    return {
-        "demo": ["demo"],
-        "data collect": ["data", "collect", "--task", "walker_walk", "--quality", "random", "--episodes", "1"],
-        "data download": ["data", "download", "--task", "walker_walk", "--quality", "random"],
-        "data view": ["data", "view", str(data)],
-        "pretrain": ["pretrain", *preset, "--data", str(data)],
-        "finetune": ["finetune", *preset, "--data", str(data), "--encoder", str(run / "encoder")],
-        "evaluate": ["evaluate", str(run)],
-        "agents export": ["agents", "export", str(run)],
-        "navigation collect": ["navigation", "collect", *preset, "--maze", "no_curtain"],
-        "navigation train": ["navigation", "train", *preset, "--data", str(data)],
-        "navigation policy": ["navigation", "policy", "--decisions", "1"],
-        "navigation report": ["navigation", "report", str(run)],
-        "sweep run": ["sweep", "run", "quick", "--testing", "--dry-run"],
-        "report": ["report", str(run)],
-        "report compare": ["report", "compare", str(run), str(run)],
-        "results add": ["results", "add", str(run)],
-        "certify": ["certify", str(data), "patch"],
-        "theory": ["theory"],
-    }
-
-
-NAMES = list(commands(Path(), Path()))
+NAMES = [name for name in VALID if name not in WITHOUT_OUT and " --" not in name]
 FILES = ("evaluate", "data view", "navigation policy")
 """Commands whose --out is a file."""
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_commands_do_not_write_into_owned_folders(name, kept, tmp_path, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
     fill(tmp_path / "trained", config__json='{"task": "walker_walk"}', curve__csv="decisions,return_mean\n")
     for folder in kept.values():
         places = [folder / "inside"] if name not in FILES else [folder / "inside.csv", folder / "not" / "there.csv"]
@@ -100,8 +75,7 @@ def test_commands_do_not_write_into_owned_folders(name, kept, tmp_path, monkeypa
             places.append(folder)
         for out in places:
             before = file_bytes(tmp_path)
-            words = [*commands(kept["a data set"], kept["a run"])[name], "--out", str(out)]
-            error = rejection(words)
+            error = rejection([*name.split(), *VALID[name], "--out", str(out)])
             assert str(out) in error
             assert "choose another " in error
             assert file_bytes(tmp_path) == before
