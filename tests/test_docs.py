@@ -137,7 +137,6 @@ def check_names(config: object) -> None:
 def study(tmp_path, monkeypatch) -> Path:
     """A working folder with the datasets that pages use; `encoder` adds a pretrained encoder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     for quality in ("expert", "expert_noisy"):
         write_fake_set(tmp_path / "data" / "walker_walk" / quality, [40, 40, 40])
     return tmp_path
@@ -178,7 +177,7 @@ def test_python_blocks_run(page, encoder):
     check_results(page.stem, namespace)
 
 
-def test_notebook_runs_and_has_no_outputs(tmp_path, own_cache, monkeypatch):
+def test_notebook_runs_and_has_no_outputs(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.mkdtemp", lambda: str(tmp_path / "study"))
     cells = json.loads((ROOT / "docs/notebooks/tour.ipynb").read_text())["cells"]
     namespace = {"__name__": "tour"}

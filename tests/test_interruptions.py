@@ -51,25 +51,6 @@ FINETUNE = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cache(tmp_path_factory):
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
-        yield
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_fake_set(tmp_path_factory.mktemp("set") / "walker_walk" / "expert", [20, 25, 30])
-
-
-@pytest.fixture(scope="module")
-def encoder(data, tmp_path_factory) -> Path:
-    return run_pretrain(smoke_pretrain(data, tmp_path_factory.mktemp("made"), method="no_history")).path / "encoder"
-
-
 @pytest.fixture(scope="module")
 def finetuned(data, encoder, tmp_path_factory) -> Path:
     """A finished run with `FINETUNE`."""
@@ -280,7 +261,7 @@ def test_resuming_with_changed_inputs_is_rejected(encoder, finetuned, data, tmp_
     pretraining = shutil.copytree(encoder.parent, tmp_path / "pretrain")
     finetuning = shutil.copytree(finetuned, tmp_path / "finetune")
     attempts = [
-        (run_pretrain, smoke_pretrain(other, pretraining, method="no_history"), "data"),
+        (run_pretrain, smoke_pretrain(other, pretraining), "data"),
         (run_finetune, smoke_finetune(encoder, other, finetuning, **FINETUNE), "data"),
         (run_finetune, smoke_finetune(acro, data, finetuning, **FINETUNE), "encoder"),
     ]

@@ -17,7 +17,6 @@ from vd4rl_pomdp.core.options import RUNTIME_FIELDS, flag_of
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.sweeps.driver import PATIENCE_S
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 DOCS = Path(__file__).parents[1] / "docs"
 LENGTHS = (20, 25)
 

@@ -46,7 +46,7 @@ def copy_tree(target: Path) -> None:
 
 def run_tests(tree: Path, tests: list[str]) -> int:
     """Pytest's exit code; a timeout counts as a failure."""
-    env = os.environ | {"PYTHONPATH": str(tree), "VD4RL_POMDP_CACHE": f"{tree}-cache"}
+    env = os.environ | {"PYTHONPATH": str(tree)}
     env["PYTHONDONTWRITEBYTECODE"] = "1"  # bytecode is taken for that of a mutant of equal size in the same second
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"--basetemp={tree}-tests", *tests]
     with suppress(subprocess.TimeoutExpired), open(f"{tree}.log", "a") as log:

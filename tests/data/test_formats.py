@@ -532,7 +532,7 @@ def test_import_holds_two_shards_at_most(tmp_path, monkeypatch):
     assert peak < 2.5 * 200 * 3 * 84**2
 
 
-def test_short_episodes_are_left_out(tmp_path, own_cache, capsys):
+def test_short_episodes_are_left_out(tmp_path, capsys):
     own = write_fake_set(tmp_path / "own", [20, 5, 25, 1], attributes={"task": "walker_walk"})
     with pytest.raises(UserError, match=r"holds no episodes of 26 or more rows"):
         import_set("vd4rl", str(own), tmp_path / "none", shortest=26)
@@ -593,7 +593,7 @@ def test_minari_recording_through_autoreset_prints_a_note(minari, tmp_path, caps
     assert "every episode begins with the last image of the one before" in capsys.readouterr().err
 
 
-def test_set_without_task_trains_without_evaluation(tmp_path, own_cache):
+def test_set_without_task_trains_without_evaluation(tmp_path):
     source = str(write_fake_set(tmp_path / "own", LENGTHS))
     folder = import_set("vd4rl", source, tmp_path / "pushing", quality="x")[0].parent
     pretrain(smoke_pretrain(folder, tmp_path / "run"))

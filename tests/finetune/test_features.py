@@ -17,9 +17,6 @@ LENGTHS, VIEWS, N, GAMMA = (6, 4), 3, 2, 0.5
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
 
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
-
 def test_feature_batches_are_aligned(tmp_path):
     dataset = open_dataset(write_fake_set(tmp_path / "set", LENGTHS))
     features = torch.stack(torch.meshgrid(torch.arange(VIEWS), torch.arange(len(ROWS)), indexing="ij"), -1)

@@ -16,7 +16,6 @@ from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.policies import load_actor
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 ROWS = 12
 
 

@@ -26,7 +26,6 @@ from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.results import find_results
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 CORRUPTION = "patch+zero_frames"
 """The pretraining corruption of `encoder`."""
 
@@ -126,7 +125,7 @@ def test_unfit_datasets_and_missing_gpus_leave_no_run(encoder, data, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_missing_result_of_finished_run_is_reported_and_rewritten(run, encoder, data):
+def test_missing_result_of_finished_run_is_reported_and_rewritten(run, finished, encoder, data):
     config = smoke_finetune(encoder, data, run, **BRIEF)
     for name in RESULTS:
         kept = (run / name).rename(run / "kept")
@@ -138,7 +137,7 @@ def test_missing_result_of_finished_run_is_reported_and_rewritten(run, encoder, 
     for name in RESULTS:
         (run / name).unlink()
     (run / "timing.json").unlink()
-    assert contents(run_finetune(config).path) == contents(encoder.parents[1] / "run")
+    assert contents(run_finetune(config).path) == contents(finished)
 
 
 @pytest.mark.parametrize(

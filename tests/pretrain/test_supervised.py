@@ -25,7 +25,6 @@ from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.methods import ROWS, build, windows
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 LAYOUT = TASKS.named("walker_walk").layout
 METHOD_NAMES = ["supervised", "supervised+a", "supervised_picture", "integrator"]
 

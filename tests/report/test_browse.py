@@ -17,8 +17,6 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
 from vd4rl_pomdp.data import View, open_dataset
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 def content_of(page: Path) -> dict:
     return json.loads(re.search(r'<script type="application/json" id="content">(.*?)</script>', page.read_text())[1])

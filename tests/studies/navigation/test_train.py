@@ -28,13 +28,6 @@ from vd4rl_pomdp.studies.navigation.train import (
 )
 
 
-@pytest.fixture(autouse=True)
-def _cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.getbasetemp() / "maze-cache"))
-    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
-    torch.set_num_threads(1)
-
-
 def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
     given = {"data": data, "out": out, "steps": 8, "log_every": 2, "checkpoint_every": 4, "precision": "fp32"}
     return NavigationConfig.of("smoke", **(given | changes))
