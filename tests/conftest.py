@@ -58,23 +58,25 @@ def pytest_terminal_summary(terminalreporter):
             terminalreporter.write(text)
 
 
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    """Use a cache in `tmp_path`, and record no path of pytest as the command of runs."""
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+@pytest.fixture(autouse=True, scope="session")
+def _cache_and_command(tmp_path_factory):
+    """Decode sets into a cache of this session, and record no path of pytest as the command of runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+        yield
 
 
-@pytest.fixture
-def data(tmp_path) -> Path:
-    """A small expert set of walker_walk."""
-    return write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25, 30])
+@pytest.fixture(scope="session")
+def data(tmp_path_factory) -> Path:
+    """A small expert set of walker_walk, shared by all tests."""
+    return write_fake_set(tmp_path_factory.mktemp("set") / "walker_walk" / "expert", [20, 25, 30])
 
 
-@pytest.fixture
-def encoder(data, own_cache, tmp_path) -> Path:
-    """Folder of an encoder pretrained on `data`."""
+@pytest.fixture(scope="session")
+def encoder(data, tmp_path_factory) -> Path:
+    """Folder of an encoder pretrained on `data`, shared by all tests."""
     from pretrain.train import pretrain
     from tests.helpers_stages import smoke_pretrain  # imported late: most tests train nothing
 
-    return pretrain(smoke_pretrain(data, tmp_path / "pretrained")).path / "encoder"
+    return pretrain(smoke_pretrain(data, tmp_path_factory.mktemp("pretrained") / "run")).path / "encoder"

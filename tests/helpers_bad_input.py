@@ -12,6 +12,34 @@ from vd4rl_pomdp.cli import main, run_to_end
 SET, ENCODER, RUN = "walker_walk/expert", "runs/pretrained/encoder", "runs/finetuned"
 PRETRAIN = ["--preset", "smoke", "--steps", "2"]
 FINETUNE = ["--preset", "smoke", "--updates", "2", "--eval-length", "2", "--workers", "1"]
+VALID = {
+    "demo": [],
+    "data check": [SET],
+    "data parity": [SET],
+    "data view": [SET],
+    "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1"],
+    "data download": ["--task", "walker_walk", "--quality", "random"],
+    "pretrain": ["--data", SET, "--corruption", "patch+zero_frames", *PRETRAIN],
+    "pretrain --method homer": ["--data", SET, *PRETRAIN],
+    "finetune": ["--encoder", ENCODER, "--data", SET, *FINETUNE],
+    "finetune --algorithm iql": ["--encoder", ENCODER, "--data", SET, *FINETUNE],
+    "evaluate": [RUN, "--episodes", "1", "--workers", "1"],
+    "report": ["runs"],
+    "report compare": ["runs", "runs"],
+    "results add": ["runs"],
+    "results verify": ["results"],
+    "agents export": [RUN, "--episodes", "1", "--workers", "1"],
+    "navigation collect": ["--maze", "no_curtain", "--preset", "smoke"],
+    "navigation train": ["--data", SET, "--preset", "smoke"],
+    "navigation policy": ["--decisions", "1"],
+    "navigation report": ["runs"],
+    "sweep run": ["quick", "--testing", "--dry-run"],
+    "certify": [SET, "patch"],
+    "theory": [],
+}
+"""Valid arguments of commands in the folder of `build_world`, without --out."""
+WITHOUT_OUT = ("data check", "data parity", "results verify")
+"""Those of `VALID` that have no --out."""
 
 
 def build_world(folder: Path) -> None:

@@ -53,15 +53,21 @@ def fake_episode(episode: int, length: int, action_dim: int = 6, complete: bool 
 
 
 def fake_rows(
-    lengths: Sequence[int], action_dim: int = 6, complete_last: bool = True, physics_dim: int = 0
+    lengths: Sequence[int], action_dim: int = 6, complete_last: bool = True, physics_dim: int = 0, noise: int = 0
 ) -> dict[str, np.ndarray]:
-    """Rows of a dataset; `physics`, if requested, holds (episode, t, 0, ...)."""
+    """Rows of a dataset; `physics`, if requested, holds (episode, t, 0, ...).
+
+    With `noise`, frames have this size and random pixels, none of them 0.
+    """
     last = len(lengths) - 1
     episodes = [fake_episode(i, n, action_dim, complete_last or i < last) for i, n in enumerate(lengths)]
     rows = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
     if physics_dim:
         rows["physics"] = np.zeros((len(rows["reward"]), physics_dim))
         rows["physics"][:, :2] = [(i, t) for i, n in enumerate(lengths) for t in range(n)]
+    if noise:
+        shape = (len(rows["reward"]), 3, noise, noise)
+        rows["observation"] = np.random.default_rng(0).integers(1, 256, shape, np.uint8)
     return rows
 
 
@@ -71,6 +77,7 @@ def write_fake_set(
     action_dim: int = 6,
     complete_last: bool = True,
     physics_dim: int = 0,
+    noise: int = 0,
     cuts: Sequence[int] = (),
     names: Sequence[str] | None = None,
     attributes: dict[str, Any] | None = None,
@@ -79,10 +86,11 @@ def write_fake_set(
 
     Args:
         folder: made if missing; name it `.../walker_walk/expert` to give the set a task and quality.
+        noise: size of frames of random pixels; 0: frames as by `fake_frame`.
         cuts: rows at which a new shard begins, anywhere in an episode.
         names: shard names in order; default `0_fake.hdf5`, `1_fake.hdf5`, ...
     """
-    rows = fake_rows(lengths, action_dim, complete_last, physics_dim)
+    rows = fake_rows(lengths, action_dim, complete_last, physics_dim, noise)
     edges = [0, *cuts, len(rows["reward"])]
     names = names or [f"{i}_fake.hdf5" for i in range(len(edges) - 1)]
     for name, start, end in zip(names, edges[:-1], edges[1:], strict=True):
@@ -103,6 +111,11 @@ def read_shard(path: Path) -> dict[str, np.ndarray]:
     """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, S, S) uint8 frames."""
     rows = read_rows(path)
     return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}
+
+
+def file_bytes(folder: Path, pattern: str = "*") -> dict[str, bytes]:
+    """Contents of the files below a folder whose names match `pattern`."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob(pattern) if p.is_file()}
 
 
 def rows_of_set(folder: Path) -> dict[str, np.ndarray]:

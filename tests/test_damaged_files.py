@@ -30,10 +30,8 @@ READERS = [
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("world")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
-        build_world(folder)
-        yield folder
+    build_world(folder)
+    return folder
 
 
 def _truncated(draw, whole: bytes) -> bytes:

@@ -52,8 +52,7 @@ def load(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_documented_plugins_run_in_all_stages_and_are_recorded(load, tmp_path, monkeypatch, kind):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+def test_documented_plugins_run_in_all_stages_and_are_recorded(load, tmp_path, kind):
     load(kind)
     name, option, value = EXAMPLES[kind]
     runs, data = tmp_path / "runs", write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25, 30])
@@ -207,8 +206,7 @@ class Dirt(Options):
         frames[..., :9, :] = 0
 
 
-def test_corruption_is_checked_on_frames_of_the_dataset(registries, tmp_path, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+def test_corruption_is_checked_on_frames_of_the_dataset(registries, tmp_path):
     registries["corruption"].register("dirt", Dirt)
     data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
     config = PretrainConfig.of("smoke", method="random", corruption="dirt", data=data, out=tmp_path / "out")

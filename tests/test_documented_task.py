@@ -33,9 +33,6 @@ PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"
 CODE = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
 
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
-
 @pytest.fixture
 def tasks():
     with TASKS.isolated():

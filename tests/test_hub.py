@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_data import write_fake_set
+from tests.helpers_data import file_bytes, write_fake_set
 from tests.helpers_hub import TOKEN, Hub, Repo
 from tests.helpers_pages import agent_card
 from tests.nn.test_encoder import CARD, make
@@ -66,8 +66,7 @@ def data(tmp_path) -> Path:
 
 def content(folder: Path) -> dict[str, bytes]:
     """Files of a folder, except hidden ones."""
-    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+    return file_bytes(folder, "[!.]*")
 
 
 def lists(folder: Path) -> list[str]:

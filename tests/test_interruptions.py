@@ -21,16 +21,16 @@ from finetune.features import _ENCODED, FrozenEncoder
 from finetune.train import finetune as run_finetune
 from pretrain.train import Trainer
 from pretrain.train import pretrain as run_pretrain
-from tests.helpers_data import write_fake_set
+from tests.helpers_data import fake_rows, write_fake_set, write_rows
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
+from vd4rl_pomdp.runs.loop import Loop
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
@@ -51,25 +51,6 @@ FINETUNE = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cache(tmp_path_factory):
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
-        yield
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_fake_set(tmp_path_factory.mktemp("set") / "walker_walk" / "expert", [20, 25, 30])
-
-
-@pytest.fixture(scope="module")
-def encoder(data, tmp_path_factory) -> Path:
-    return run_pretrain(smoke_pretrain(data, tmp_path_factory.mktemp("made"), method="no_history")).path / "encoder"
-
-
 @pytest.fixture(scope="module")
 def finetuned(data, encoder, tmp_path_factory) -> Path:
     """A finished run with `FINETUNE`."""
@@ -79,21 +60,9 @@ def finetuned(data, encoder, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def maze(tmp_path_factory) -> Path:
     """A maze dataset with random frames."""
-    folder, rng, rows = tmp_path_factory.mktemp("maze"), np.random.default_rng(0), 120
-    step_type = np.tile([0, *[1] * 28, 2], 4)
-    write_shard(
-        folder / "0_three_curtains.hdf5",
-        {
-            "observation": rng.integers(0, 256, (rows, 3, 100, 100), np.uint8),
-            "action": rng.uniform(-1, 1, (rows, 2)),
-            "reward": np.zeros(rows),
-            "discount": np.ones(rows),
-            "step_type": step_type,
-            "physics": rng.normal(size=(rows, 4)),
-        },
-        {"task": "three_curtains"},
-    )
-    return folder
+    rows = fake_rows([30] * 4, action_dim=2, noise=100)
+    rows["physics"] = np.random.default_rng(0).normal(size=(120, 4))
+    return write_rows(tmp_path_factory.mktemp("maze"), rows, {"task": "three_curtains"})
 
 
 Stage = tuple[Callable[[Any], Any], Callable[[Path], Any], Any]
@@ -292,7 +261,7 @@ def test_resuming_with_changed_inputs_is_rejected(encoder, finetuned, data, tmp_
     pretraining = shutil.copytree(encoder.parent, tmp_path / "pretrain")
     finetuning = shutil.copytree(finetuned, tmp_path / "finetune")
     attempts = [
-        (run_pretrain, smoke_pretrain(other, pretraining, method="no_history"), "data"),
+        (run_pretrain, smoke_pretrain(other, pretraining), "data"),
         (run_finetune, smoke_finetune(encoder, other, finetuning, **FINETUNE), "data"),
         (run_finetune, smoke_finetune(acro, data, finetuning, **FINETUNE), "encoder"),
     ]
@@ -348,22 +317,27 @@ def test_failed_append_leaves_a_run_unchanged(finetuned, tmp_path):
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])
+@pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2), (2, None)])
 def test_interrupted_evaluation_is_repeated(encoder, finetuned, data, tmp_path, monkeypatch, evaluation, rows_written):
-    """Also in the last evaluation, which includes clean episodes."""
+    """Also in the last evaluation, which includes clean episodes, and after its row of metrics."""
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     append, evaluations = finetune.trainer.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         evaluations.append(rows)
-        if len(evaluations) < evaluation:
+        if len(evaluations) < evaluation or rows_written is None:
             append(path, rows)
             return
         append(path, rows[:rows_written])
         raise KeyboardInterrupt
 
+    def show(self, **shown: float) -> None:
+        if len(evaluations) == evaluation:
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
         patch.setattr(finetune.trainer, "append_episodes", cut)
+        patch.setattr(Loop, "show", show)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     if evaluation == 2:

@@ -129,11 +129,7 @@ def python(tmp_path):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-parts\nVersion: 1.2\n")
     entries = (f"[vd4rl_pomdp.{kind}s]\n{name} = their_parts:{what}\n" for kind, (name, what, *_) in PARTS.items())
     (info / "entry_points.txt").write_text("\n".join(entries))
-    environment = os.environ | {
-        "PYTHONPATH": f"{site}{os.pathsep}{ROOT}",
-        "VD4RL_POMDP_CACHE": str(tmp_path / "cache"),
-        "COLUMNS": "200",
-    }
+    environment = os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{ROOT}", "COLUMNS": "200"}
 
     def run(*words: object) -> str:
         command = [sys.executable, *map(str, words)]

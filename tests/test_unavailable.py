@@ -153,7 +153,7 @@ def shard(tmp_path) -> Path:
     return min(write_fake_set(tmp_path / "walker_walk" / "expert").glob("*.hdf5"))
 
 
-def test_locked_shard_is_reported_as_temporary(shard, own_cache):
+def test_locked_shard_is_reported_as_temporary(shard):
     with shard.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with pytest.raises(UnavailableError, match="HDF5_USE_FILE_LOCKING=FALSE"):

@@ -11,12 +11,12 @@ from finetune.trainer import FinetuneTrainer
 from pretrain.train import make_batches, make_objective
 from pretrain.train import pretrain as run_pretrain
 from tests.finetune.test_features import noise_set
+from tests.helpers_data import write_fake_set
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.options import RUNTIME_FIELDS, flag_of
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.sweeps.driver import PATIENCE_S
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 DOCS = Path(__file__).parents[1] / "docs"
 LENGTHS = (20, 25)
 
@@ -24,8 +24,7 @@ LENGTHS = (20, 25)
 @pytest.fixture
 def data(tmp_path) -> Path:
     """A set of random pictures, on which shifts, masks and precisions change features."""
-    noise_set(tmp_path / "walker_walk" / "expert", lengths=LENGTHS)
-    return tmp_path / "walker_walk" / "expert"
+    return write_fake_set(tmp_path / "walker_walk" / "expert", LENGTHS, noise=84)
 
 
 def test_pretraining_seeds_differ_and_methods_share_batches_and_masks(data, tmp_path):

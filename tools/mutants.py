@@ -23,7 +23,7 @@ LIMIT_S = 600
 
 
 def load_mutants() -> list[dict[str, str]]:
-    """All mutants in order, each with name, file, old, new, claim and test."""
+    """All mutants in order, each with name, file, old, new and test."""
     return [mutant for section in tomllib.loads(LIST.read_text(encoding="utf-8")).values() for mutant in section]
 
 
@@ -46,7 +46,7 @@ def copy_tree(target: Path) -> None:
 
 def run_tests(tree: Path, tests: list[str]) -> int:
     """Pytest's exit code; a timeout counts as a failure."""
-    env = os.environ | {"PYTHONPATH": str(tree), "VD4RL_POMDP_CACHE": f"{tree}-cache"}
+    env = os.environ | {"PYTHONPATH": str(tree)}
     env["PYTHONDONTWRITEBYTECODE"] = "1"  # bytecode is taken for that of a mutant of equal size in the same second
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"--basetemp={tree}-tests", *tests]
     with suppress(subprocess.TimeoutExpired), open(f"{tree}.log", "a") as log:

@@ -133,7 +133,6 @@ class Wavering(Alternating):
 MUTANTS = [
     (Nothing, checks.something_changes, "none differs"),
     (Batchwise, checks.equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
-    (Batchwise, checks.the_environment_shows_what_the_data_show, "a row looks different in the environment"),
     (Exposing, checks.equal_keys_give_equal_masks, "a stack looks different in a batch than by itself"),
     (Drawing, checks.draws_depend_only_on_keys, "equal keys gave different pixels"),
     (Counting, checks.emission_never_changes_a_row, "a row looked different the second time"),

@@ -41,7 +41,7 @@ def test_methods_conform_with_documented_memory(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("history", ["transformer", "lru"])
-def test_memories_train_in_all_stages(data, own_cache, tmp_path, history):
+def test_memories_train_in_all_stages(data, tmp_path, history):
     made = pretrain(smoke_pretrain(data, tmp_path / "pretrained", method="mik+a", history=history, steps=1)).path
     brief = {"updates": 1, "batch_size": 4, "eval_length": 2, "random_histories": 0.5, "precision": "bf16"}
     assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from tests.helpers_envs import Counter
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask, Layout
 from vd4rl_pomdp.data.check import check_dataset
@@ -174,32 +175,13 @@ def test_too_short_episodes_are_rejected():
         make_env(DMCTask("walker", "walk", decisions=0))
 
 
-class OddRewardEnv(gymnasium.Env):
-    """Returns a valid reward in its first step and `paid` afterwards."""
-
-    def __init__(self, paid, render_mode=None):
-        self.paid, self.render_mode, self.steps = paid, render_mode, 0
-        self.observation_space = gymnasium.spaces.Box(0, 255, (1,))
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(1), {}
-
-    def step(self, action):
-        self.steps += 1
-        return np.zeros(1), 1.0 if self.steps == 1 else self.paid, False, False, {}
-
-    def render(self):
-        return np.zeros((84, 84), np.uint8)
-
-
 @pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf, None, "much", np.ones(2)])
 def test_non_numeric_reward_is_rejected(paid):
-    env = make_env(GymnasiumTask(OddRewardEnv, {"paid": paid}))
+    env = make_env(GymnasiumTask(Counter, {"pays": [1.0, paid]}))
     env.reset(0)
     assert env.step(np.zeros(2, np.float32)).reward == 1
     with pytest.raises(
-        UserError, match=rf"environment OddRewardEnv returns the reward {re.escape(str(paid))}, expected a number"
+        UserError, match=rf"environment Counter returns the reward {re.escape(str(paid))}, expected a number"
     ):
         env.step(np.zeros(2, np.float32))
 
@@ -212,8 +194,8 @@ def test_non_numeric_reward_is_rejected(paid):
     ],
 )
 def test_environment_of_another_interface_is_rejected(monkeypatch, method, given, message):
-    monkeypatch.setattr(OddRewardEnv, method, lambda self, *words, **more: given)
-    env = make_env(GymnasiumTask(OddRewardEnv, {"paid": 1.0}))
+    monkeypatch.setattr(Counter, method, lambda self, *words, **more: given)
+    env = make_env(GymnasiumTask(Counter))
     if method == "step":
         env.reset(0)
     with pytest.raises(UserError, match=message):

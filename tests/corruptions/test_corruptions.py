@@ -1,10 +1,9 @@
 import re
 
-import numpy as np
 import pytest
 import torch
 
-from tests.helpers_data import fake_rows
+from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat, settings_of
 from vd4rl_pomdp.corruptions import (
@@ -21,7 +20,6 @@ from vd4rl_pomdp.corruptions import (
 )
 from vd4rl_pomdp.corruptions.augmentation import random_shift, shift_by_index
 from vd4rl_pomdp.data import Dataset, View, open_dataset
-from vd4rl_pomdp.data.format import write_shard
 
 
 def stacks(n: int = 64) -> torch.Tensor:
@@ -68,11 +66,7 @@ def test_keys_must_match_stacks(key):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
     """Three short episodes of random pixels."""
-    folder = tmp_path_factory.mktemp("noise")
-    rows = fake_rows([7, 5, 12])
-    rows["observation"] = np.random.default_rng(0).integers(1, 256, rows["observation"].shape, dtype=np.uint8)
-    write_shard(folder / "0_noise.hdf5", rows, {})
-    return open_dataset(folder)
+    return open_dataset(write_fake_set(tmp_path_factory.mktemp("noise"), [7, 5, 12], noise=84))
 
 
 def test_draws_are_uniform_and_depend_on_every_key():

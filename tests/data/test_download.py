@@ -151,7 +151,7 @@ def test_bad_and_unreachable_endpoints_are_rejected(tmp_path, monkeypatch, endpo
     assert not list(tmp_path.rglob("*.hdf5"))
 
 
-@pytest.mark.usefixtures("mirror", "own_cache")
+@pytest.mark.usefixtures("mirror")
 def test_incomplete_published_set_names_download_command(tmp_path):
     place = write_fake_set(tmp_path / EXPERT, names=["0_a_expert.hdf5"])
     part = f"{place}: contains 1 of 2 shards of V-D4RL's walker_walk expert (1_a_expert.hdf5 is missing); get the rest "
@@ -161,7 +161,7 @@ def test_incomplete_published_set_names_download_command(tmp_path):
             read(place)
 
 
-@pytest.mark.usefixtures("mirror", "own_cache")
+@pytest.mark.usefixtures("mirror")
 def test_sets_that_are_not_published_parts_are_opened(tmp_path):
     names = ["0_a_expert.hdf5", "1_a_expert.hdf5"]
     attributes = {"task": "walker_walk", "set": "expert"}

@@ -18,6 +18,7 @@ from tests.helpers_data import (
     fake_episode,
     fake_frame,
     fake_reward,
+    fake_rows,
     rows_of_set,
     write_fake_set,
     write_rows,
@@ -443,9 +444,8 @@ def test_published_64_pixel_sets_print_a_note(tmp_path, capsys):
 
 
 def test_resized_frames_are_area_means(tmp_path, capsys):
-    rows = fake_episode(0, 6)
-    rows["observation"] = np.random.default_rng(0).integers(0, 256, (6, 3, 84, 84), np.uint8)
-    own = str(write_rows(tmp_path / "own", rows, {"task": "walker_walk", "set": "expert"}))
+    attributes = {"task": "walker_walk", "set": "expert"}
+    own = str(write_fake_set(tmp_path / "own", [6], noise=84, attributes=attributes))
     import_set("vd4rl", own, tmp_path / "small", size=50)
     told = capsys.readouterr().err
     assert "images of 84x84 pixels become 50x50 (area means)" in told
@@ -453,7 +453,9 @@ def test_resized_frames_are_area_means(tmp_path, capsys):
     import_set("vd4rl", own, tmp_path / "maze", task="elsewhere", size=50)
     assert "evaluations" not in capsys.readouterr().err
     small = rows_of_set(tmp_path / "small")
-    means = [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]
+    means = [
+        area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in fake_rows([6], noise=84)["observation"]
+    ]
     np.testing.assert_array_equal(small["observation"], means)
     assert_equal_rows(rows_of_set(tmp_path / "own"), small, but=["observation"])
 
@@ -536,7 +538,7 @@ def test_minari_export_needs_space_for_its_images(minari, tmp_path, monkeypatch)
     assert not [path for path in tmp_path.iterdir() if "a-v0" in path.name]
 
 
-def test_short_episodes_are_left_out(tmp_path, own_cache, capsys):
+def test_short_episodes_are_left_out(tmp_path, capsys):
     own = write_fake_set(tmp_path / "own", [20, 5, 25, 1], attributes={"task": "walker_walk"})
     with pytest.raises(UserError, match=r"holds no episodes of 26 or more rows"):
         import_set("vd4rl", str(own), tmp_path / "none", shortest=26)
@@ -597,7 +599,7 @@ def test_minari_recording_through_autoreset_prints_a_note(minari, tmp_path, caps
     assert "every episode begins with the last image of the one before" in capsys.readouterr().err
 
 
-def test_set_without_task_trains_without_evaluation(tmp_path, own_cache):
+def test_set_without_task_trains_without_evaluation(tmp_path):
     source = str(write_fake_set(tmp_path / "own", LENGTHS))
     folder = import_set("vd4rl", source, tmp_path / "pushing", quality="x")[0].parent
     pretrain(smoke_pretrain(folder, tmp_path / "run"))

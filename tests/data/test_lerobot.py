@@ -28,10 +28,7 @@ DATA, INDEX = (f"{part}/chunk-000/file-000.parquet" for part in ("data", "meta/e
 @pytest.fixture
 def exported(tmp_path):
     """A set with noise images in LeRobot's format, and its source."""
-    rng, episodes = np.random.default_rng(0), [fake_episode(number, length) for number, length in enumerate(LENGTHS)]
-    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
-    rows[FRAMES_KEY] = rng.integers(0, 256, rows[FRAMES_KEY].shape, np.uint8)
-    own = write_rows(tmp_path / "own", rows, {"task": "walker_walk", "set": "mine"})
+    own = write_fake_set(tmp_path / "own", LENGTHS, noise=84, attributes={"task": "walker_walk", "set": "mine"})
     export_set("lerobot", own, tmp_path / "out")
     return tmp_path / "out", own
 

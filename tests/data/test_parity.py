@@ -49,7 +49,7 @@ def test_render_info_names_versions_and_renderer(exact):
 
 
 @pytest.mark.parametrize("task", ["walker_walk", "cheetah_run"])
-def test_background_of_a_set_decides(tmp_path, own_cache, monkeypatch, task):
+def test_background_of_a_set_decides(tmp_path, monkeypatch, task):
     """A GPU renders other canaries, but the same pixels as a set rendered on a GPU."""
     sets = {}
     for name in ("ours", "other sky"):
@@ -69,6 +69,6 @@ def test_background_of_a_set_decides(tmp_path, own_cache, monkeypatch, task):
     assert check_parity()["equal"]
 
 
-def test_parity_of_unknown_task_is_rejected(tmp_path, own_cache):
+def test_parity_of_unknown_task_is_rejected(tmp_path):
     with pytest.raises(UserError, match="cannot determine the task"):
         check_parity(write_fake_set(tmp_path / "set"))

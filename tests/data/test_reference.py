@@ -14,7 +14,6 @@ from vd4rl_pomdp.policies import load_actor
 from vd4rl_pomdp.policies.actor import ASSETS
 from vd4rl_pomdp.runs import REFERENCE_FILE
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 EXPERT, MEDIUM = (load_actor("walker_walk", quality).sha256 for quality in ("expert", "medium"))
 ACTOR = {"task": "walker_walk", "quality": "expert", "sha256": EXPERT}
 

@@ -207,27 +207,19 @@ def test_shards_of_different_sets_are_rejected(tmp_path, cache, second, key):
         open_store(tmp_path / "set", cache)
 
 
-def with_frames(folder, size, number=0):
-    """Write a shard of one episode with `size` x `size` frames."""
-    rows = fake_rows([6])
-    rows["observation"] = np.random.default_rng(size).integers(0, 256, (6, 3, size, size), dtype=np.uint8)
-    folder.mkdir(exist_ok=True)
-    write_shard(folder / f"{number}_fake.hdf5", rows, {})
-    return rows["observation"]
-
-
 @pytest.mark.parametrize("size", [16, 480])
 def test_frame_size_is_read_from_shards(tmp_path, cache, size):
-    frames = with_frames(tmp_path / "set", size)
+    write_fake_set(tmp_path / "set", [6], noise=size)
     for _ in range(2):
-        np.testing.assert_array_equal(open_store(tmp_path / "set", cache).frames(), frames)
-    with_frames(tmp_path / "set", 84, number=1)
+        frames = open_store(tmp_path / "set", cache).frames()
+        np.testing.assert_array_equal(frames, fake_rows([6], noise=size)["observation"])
+    write_fake_set(tmp_path / "set", [6], names=["1_fake.hdf5"])
     with pytest.raises(UserError, match=rf"1_fake.hdf5: has frames of 84x84 pixels, 0_fake.hdf5 of {size}x{size}"):
         open_store(tmp_path / "set", cache)
 
 
 @pytest.mark.parametrize("size", [15, 481])
 def test_unsupported_frame_sizes_are_rejected(tmp_path, cache, size):
-    with_frames(tmp_path / "set", size)
+    write_fake_set(tmp_path / "set", [6], noise=size)
     with pytest.raises(UserError, match=r"square uint8 frames \(N, 3, S, S\) of 16 to 480 pixels"):
         open_store(tmp_path / "set", cache)

@@ -2,6 +2,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from tests.helpers_envs import Counter
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.core.types import StepType
@@ -9,35 +10,6 @@ from vd4rl_pomdp.envs.gym import GymEnv
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.rendering import mujoco
-
-
-class Counter(gymnasium.Env):
-    """Shows the number of steps as a grey level; rewards are 1, 2, 3, ..., and `end` is the last step."""
-
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
-
-    def __init__(self, shape=(20, 30), end=1000, truncates=False, low=-1.0, high=1.0, render_mode=None, space=None):
-        self.shape, self.end, self.truncates, self.render_mode = shape, end, truncates, render_mode
-        self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
-        self.action_space = space or gymnasium.spaces.Box(low, high, (2, 1), np.float64)
-        self.actions = []
-
-    def picture(self):
-        return np.full(self.shape, self.steps, np.uint8)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return self.picture(), {}
-
-    def step(self, action):
-        self.steps += 1
-        self.actions.append(action)
-        ends = self.steps >= self.end
-        return self.picture(), self.steps, ends and not self.truncates, ends and self.truncates, {}
-
-    def render(self):
-        return self.picture()
 
 
 def play(task, decisions, **options):

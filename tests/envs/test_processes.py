@@ -3,7 +3,6 @@
 PyTorch's GPU builds include Triton; otherwise the `dev` extra installs it.
 """
 
-import ast
 import contextlib
 import os
 import signal
@@ -11,26 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("processes_script.py")
-ENVS = ROOT / "vd4rl_pomdp" / "envs"
-
-
-def imported(path: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module.split(".")[0])
-        elif isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[0] for alias in node.names}
-    return found
-
-
-def test_only_rendering_module_imports_mujoco():
-    folders = ("vd4rl_pomdp", "pretrain", "finetune", "baselines", "tests")
-    sources = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
-    loading = {path for path in sources if imported(path) & {"dm_control", "mujoco"}}
-    assert loading - {ENVS / "maze_renderers.py"} == {ENVS / "rendering.py"}  # the former imports the latter
 
 
 def test_vector_environments_work_or_are_rejected(tmp_path):

@@ -6,19 +6,15 @@ import torch
 
 from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
-from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
+from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set, write_rows
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
 
 LENGTHS, VIEWS, N, GAMMA = (6, 4), 3, 2, 0.5
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
-
-
-pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def test_feature_batches_are_aligned(tmp_path):
@@ -43,12 +39,9 @@ def test_feature_batches_are_aligned(tmp_path):
 
 def noise_set(folder, first_action: float = 0.0, lengths: tuple[int, ...] = LENGTHS) -> Dataset:
     """Episodes of random pixels; their first rows store `first_action`, which was never taken."""
-    rows = fake_rows(lengths)
-    rows["observation"] = np.random.default_rng(0).integers(1, 256, rows["observation"].shape, dtype=np.uint8)
+    rows = fake_rows(lengths, noise=84)
     rows["action"][rows["step_type"] == 0] = first_action
-    folder.mkdir(parents=True)
-    write_shard(folder / "0_noise.hdf5", rows, {})
-    return open_dataset(folder)
+    return open_dataset(write_rows(folder, rows))
 
 
 def frozen(

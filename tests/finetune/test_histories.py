@@ -19,7 +19,6 @@ from vd4rl_pomdp.data import View
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
 
 N = 2
-pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(params=[("gru", {}), ("transformer", {"attention_window": 3}), ("lru", {})], ids=lambda kind: kind[0])

@@ -8,16 +8,14 @@ from finetune import trainer
 from finetune.train import finetune
 from finetune.trainer import path_error
 from tests.finetune.conftest import BRIEF
-from tests.helpers_data import fake_rows
+from tests.helpers_data import fake_rows, write_rows
 from tests.helpers_stages import smoke_finetune
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.policies import load_actor
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 ROWS = 12
 
 
@@ -31,10 +29,8 @@ def expert_episodes(tmp_path):
         while not steps[-1].last:
             steps.append(env.step(actor.act(steps[-1].state, rng)))
     rows = fake_rows([ROWS, ROWS]) | {"physics": np.stack([step.physics for step in steps])}
-    folder = tmp_path / "walker_walk" / "expert_episodes"
-    folder.mkdir(parents=True)
     attributes = {"task": "walker_walk", "set": "expert", "actor_sha256": actor.sha256}
-    write_shard(folder / "0_walker_walk_expert.hdf5", rows, attributes)
+    folder = write_rows(tmp_path / "walker_walk" / "expert_episodes", rows, attributes)
     return folder, np.stack([step.state for step in steps]), actor
 
 

@@ -36,7 +36,6 @@ from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.run import identity
 from vd4rl_pomdp.testing.algorithms import course, farther_than_rounding
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 stacked = pytest.mark.usefixtures("stacks")
 BRIEF = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "log_every": 3, "batch_size": 4, "eval_length": 2}
 
@@ -243,16 +242,14 @@ def test_incompatible_stacks_are_rejected(encoders, data, tmp_path, first, secon
 
 
 @pytest.fixture(scope="module")
-def encoders(trained, tmp_path_factory) -> dict[str, Path]:
+def encoders(data, encoder, tmp_path_factory) -> dict[str, Path]:
     """Encoders by method, and a dataset with states."""
     folder = tmp_path_factory.mktemp("encoders")
-    made = {"mik+a": trained / "pretrained" / "encoder", "states": folder / "walker_walk" / "expert"}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VD4RL_POMDP_CACHE", str(trained / "cache"))
-        states = write_fake_set(folder / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
-        for method in ("state", "drq_bc", "bc", "acro"):
-            given = states if method == "state" else trained / "walker_walk" / "expert"
-            made[method] = pretrain(smoke_pretrain(given, folder / method, method=method)).path / "encoder"
+    states = write_fake_set(folder / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
+    made = {"mik+a": encoder, "states": states}
+    for method in ("state", "drq_bc", "bc", "acro"):
+        given = states if method == "state" else data
+        made[method] = pretrain(smoke_pretrain(given, folder / method, method=method)).path / "encoder"
     return made
 
 

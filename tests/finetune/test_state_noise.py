@@ -37,8 +37,6 @@ def with_states(tmp_path_factory) -> Iterator[Path]:
     physics = np.random.default_rng(0).normal(size=(5 * ROWS, 18)) * 10.0 ** np.arange(-2, 4).repeat(3) + 7
     physics[:, 3] = 2
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VD4RL_POMDP_CACHE", str(folder / "cache"))
-        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
         patch.setattr("vd4rl_pomdp.data.store.Store.physics", lambda self: physics.copy())
         yield path
 

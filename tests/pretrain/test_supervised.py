@@ -11,14 +11,13 @@ from pretrain.objectives import METHODS
 from pretrain.train import make_batches, make_objective
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_bad_input import rejection
-from tests.helpers_data import fake_action, fake_rows, frame_identity, write_fake_set
+from tests.helpers_data import fake_action, fake_rows, frame_identity, write_fake_set, write_rows
 from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.objective import Objective
 from vd4rl_pomdp.nn.probes import probe_state
@@ -26,7 +25,6 @@ from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.methods import ROWS, build, windows
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 LAYOUT = TASKS.named("walker_walk").layout
 METHOD_NAMES = ["supervised", "supervised+a", "supervised_picture", "integrator"]
 
@@ -172,9 +170,7 @@ def bright_square(folder: Path, episodes: int = 25, rows: int = 30) -> Path:
     near = np.exp(-((grid - low - folded.reshape(-1, 2)[..., None]) ** 2) / 8)
     picture = 40 + 200 * near[:, 0, :, None] * near[:, 1, None, :]
     rows_of["observation"] = np.repeat(picture[:, None], 3, 1).astype(np.uint8)
-    folder.mkdir(parents=True)
-    write_shard(folder / "0_square.hdf5", rows_of, {})
-    return folder
+    return write_rows(folder, rows_of)
 
 
 def test_supervised_training_improves_the_probe(tmp_path):

@@ -13,8 +13,6 @@ from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 def test_encoder_records_its_pretraining_settings(encoder):
     settings = load_encoder(encoder)[1].settings

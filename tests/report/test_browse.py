@@ -12,22 +12,10 @@ import torch
 from PIL import Image
 
 from tests.helpers_bad_input import rejection
-from tests.helpers_data import fake_rows
+from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
 from vd4rl_pomdp.data import View, open_dataset
-from vd4rl_pomdp.data.format import write_shard
-
-pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-def noisy_set(folder: Path, lengths: list[int], size: int) -> Path:
-    """A set with random pixels: all frames differ and compress poorly."""
-    rows, draw = fake_rows(lengths), np.random.default_rng(0)
-    rows["observation"] = draw.integers(1, 256, (sum(lengths), 3, size, size), np.uint8)
-    folder.mkdir(parents=True)
-    write_shard(folder / "0_noise.hdf5", rows, {})
-    return folder
 
 
 def content_of(page: Path) -> dict:
@@ -43,7 +31,7 @@ def pixels(sheet: str, content: dict, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("size", "every"), [(32, 1), (150, 2)])
 def test_viewer_shows_corrupted_frames_and_stored_curves(tmp_path, size, every):
-    folder = noisy_set(tmp_path / "walker_walk" / "expert", [7, 1, 12], size)
+    folder = write_fake_set(tmp_path / "walker_walk" / "expert", [7, 1, 12], noise=size)
     words = ["--corruption", "patch+zero_frames", "--patch-fill", "9", "--zeroed-frames", "1", "--seed", "3"]
     main(["data", "view", str(folder), "--out", str(tmp_path / "new" / "view.html"), *words])
     content, data = content_of(tmp_path / "new" / "view.html"), open_dataset(folder)
@@ -72,7 +60,7 @@ def test_viewer_shows_corrupted_frames_and_stored_curves(tmp_path, size, every):
 
 
 def test_viewer_page_fits_5_MB_and_needs_no_network(tmp_path):
-    folder = noisy_set(tmp_path / "cheetah_run" / "random", [40] * 120, 48)
+    folder = write_fake_set(tmp_path / "cheetah_run" / "random", [40] * 120, noise=48)
     main(["data", "view", str(folder), "--out", str(tmp_path / "view.html")])
     page, content = (tmp_path / "view.html").read_text(), content_of(tmp_path / "view.html")
     assert 3_500_000 < len(page.encode()) < 5_000_000
@@ -89,7 +77,7 @@ def _data(page: str) -> tuple[str, str]:
 
 
 def test_viewer_overwrites_only_its_own_page(tmp_path):
-    folder, out = noisy_set(tmp_path / "walker_walk" / "expert", [5], 16), tmp_path / "view.html"
+    folder, out = write_fake_set(tmp_path / "walker_walk" / "expert", [5], noise=16), tmp_path / "view.html"
     for corruption in ("patch", "none"):
         main(["data", "view", str(folder), "--out", str(out), "--corruption", corruption])
     assert 'id="on"' not in out.read_text(), "no switch without corruption"

@@ -1,7 +1,6 @@
 """A report's page, files and terminal output."""
 
 import csv
-import hashlib
 import io
 import os
 import re
@@ -16,6 +15,7 @@ from rich.console import Console
 
 import pretrain.objectives
 from tests.helpers_bad_input import rejection
+from tests.helpers_data import file_bytes
 from tests.helpers_report import describe, grid, pretraining, without_figures, write_run, write_seeds
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -172,19 +172,16 @@ def test_report_overwrites_only_earlier_reports(tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "index.html").write_text("mine")
 
-    def files():
-        return {p: hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.rglob("*") if p.is_file()}
-
-    before = files()
+    before = file_bytes(tmp_path)
     for out in ("runs", "runs/0", "runs/0/report", "notes"):
         assert "choose another" in rejection(["report", str(tmp_path / "runs"), "--out", str(tmp_path / out)])
-        assert files() == before
+        assert file_bytes(tmp_path) == before
     write_report([tmp_path / "runs"], tmp_path / "out")
     first = {p.name for p in (tmp_path / "out").iterdir()}
     with pytest.raises(UserError, match="the results of 2 runs that would be lost"):
         write_report([tmp_path / "runs" / "0"], tmp_path / "out")
     assert {p.name for p in (tmp_path / "out").iterdir()} == first
-    assert set(before.items()) <= set(files().items())
+    assert set(before.items()) <= file_bytes(tmp_path).items()
 
 
 def test_report_is_reproducible_from_its_own_folder(tmp_path):

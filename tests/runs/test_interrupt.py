@@ -54,7 +54,7 @@ def start(folder: Path, script: str, *words: object) -> subprocess.Popen:
     """Start a program in a new process group, as a terminal does."""
     file = folder / "program.py"
     file.write_text(script)
-    environment = os.environ | {"PYTHONPATH": os.getcwd(), "VD4RL_POMDP_CACHE": str(folder / "cache")}
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
     return subprocess.Popen(
         [sys.executable, file, *map(str, words)],
         stdout=subprocess.PIPE,

@@ -135,7 +135,6 @@ def assert_all_mirrored(run: Path) -> list[dict[str, float]]:
     return rows
 
 
-@pytest.mark.usefixtures("own_cache")
 def test_trackers_get_config_and_all_rows_of_a_resumed_run(encoder, data, tmp_path, monkeypatch):
     changes = FINETUNE | {"wandb": "offline", "tensorboard": True}
     # tracked only after resuming
@@ -173,7 +172,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.usefixtures("own_cache")
 def test_trackers_get_all_rows_of_a_killed_run(data, tmp_path):
     out, script = tmp_path / "run", tmp_path / "killed.py"
     script.write_text(KILLED)

@@ -1,7 +1,6 @@
 """Commands neither overwrite nor write into a run, policy, encoder or dataset, or a folder in use."""
 
 import errno
-import hashlib
 import json
 import os
 import signal
@@ -14,8 +13,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from tests.helpers_bad_input import rejection
-from tests.helpers_data import write_fake_set
+from tests.helpers_bad_input import RUN, SET, VALID, WITHOUT_OUT, rejection
+from tests.helpers_data import file_bytes, write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.outputs import built, in_use, kept_in, owned, refuse_foreign, refuse_inside
@@ -33,16 +32,12 @@ def kept(tmp_path) -> dict[str, Path]:
     """One folder of every kind that owns its files."""
     run = {"stage": "finetune", "config": {}, "versions": {}, "git_commit": "", "command": ""}
     return {
-        "a run": fill(tmp_path / "run", config__json=json.dumps(run), episodes__csv=""),
+        "a run": fill(tmp_path / RUN, config__json=json.dumps(run), episodes__csv=""),
         "an encoder": fill(tmp_path / "encoder", config__json="{}", model__safetensors=""),
         "a policy": fill(tmp_path / "policy", config__json='{"task": "cheetah_run"}', curve__csv=""),
-        "a data set": write_fake_set(tmp_path / "walker_walk" / "expert"),
+        "a data set": write_fake_set(tmp_path / SET),
         "a data set ": fill(tmp_path / "collecting", collection__json="{}"),
     }
-
-
-def contents(folder: Path) -> dict[str, str]:
-    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_foreign_config_files_are_no_runs(tmp_path):
@@ -66,51 +61,25 @@ def test_output_inside_owned_folders_is_rejected(kept, tmp_path):
         refuse_foreign(mine, "report", "summary.csv")
 
 
-def commands(data: Path, run: Path) -> dict[str, list[str]]:
-    """Valid arguments, without --out, of every command that has an --out."""
-    preset = ["--preset", "smoke"]
-    return {
-        "demo": ["demo"],
-        "data collect": ["data", "collect", "--task", "walker_walk", "--quality", "random", "--episodes", "1"],
-        "data download": ["data", "download", "--task", "walker_walk", "--quality", "random"],
-        "data view": ["data", "view", str(data)],
-        "pretrain": ["pretrain", *preset, "--data", str(data)],
-        "finetune": ["finetune", *preset, "--data", str(data), "--encoder", str(run / "encoder")],
-        "evaluate": ["evaluate", str(run)],
-        "agents export": ["agents", "export", str(run)],
-        "navigation collect": ["navigation", "collect", *preset, "--maze", "no_curtain"],
-        "navigation train": ["navigation", "train", *preset, "--data", str(data)],
-        "navigation policy": ["navigation", "policy", "--decisions", "1"],
-        "navigation report": ["navigation", "report", str(run)],
-        "sweep run": ["sweep", "run", "quick", "--testing", "--dry-run"],
-        "report": ["report", str(run)],
-        "report compare": ["report", "compare", str(run), str(run)],
-        "results add": ["results", "add", str(run)],
-        "certify": ["certify", str(data), "patch"],
-        "theory": ["theory"],
-    }
-
-
-NAMES = list(commands(Path(), Path()))
+NAMES = [name for name in VALID if name not in WITHOUT_OUT and " --" not in name]
 FILES = ("evaluate", "data view", "navigation policy")
 """Commands whose --out is a file."""
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_commands_do_not_write_into_owned_folders(name, kept, tmp_path, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
     fill(tmp_path / "trained", config__json='{"task": "walker_walk"}', curve__csv="decisions,return_mean\n")
     for folder in kept.values():
         places = [folder / "inside"] if name not in FILES else [folder / "inside.csv", folder / "not" / "there.csv"]
         if name not in (*FILES, "pretrain", "finetune", "navigation train"):  # these check their data first
             places.append(folder)
         for out in places:
-            before = contents(tmp_path)
-            words = [*commands(kept["a data set"], kept["a run"])[name], "--out", str(out)]
-            error = rejection(words)
+            before = file_bytes(tmp_path)
+            error = rejection([*name.split(), *VALID[name], "--out", str(out)])
             assert str(out) in error
             assert "choose another " in error
-            assert contents(tmp_path) == before
+            assert file_bytes(tmp_path) == before
 
 
 def test_all_commands_with_out_are_covered(capsys):

@@ -16,8 +16,6 @@ from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.results import certificate_id, keep_certificates
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, NEEDS_NOT, OPEN, judge
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 @pytest.fixture
 def executed(monkeypatch):

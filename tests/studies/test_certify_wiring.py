@@ -14,8 +14,6 @@ from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.studies import certify
 from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, OPEN, STATE
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 class StopError(Exception):
     pass

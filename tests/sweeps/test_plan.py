@@ -49,21 +49,17 @@ finetune = { random_histories = 0.5, algorithm = ["td3_bc", "bc"] }
 def swept(tmp_path_factory):
     """A folder with the finished jobs of the grid, on a dataset without collection record."""
     out = tmp_path_factory.mktemp("swept")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VD4RL_POMDP_CACHE", str(out / ".cache"))
-        write_fake_set(out / "data" / "walker_walk" / "expert", [20, 25, 30])
-        (out / "grid.toml").write_text(GRID)
-        for job in plan(out):
-            if not job.finished:
-                main(list(job.words))
+    write_fake_set(out / "data" / "walker_walk" / "expert", [20, 25, 30])
+    (out / "grid.toml").write_text(GRID)
+    for job in plan(out):
+        if not job.finished:
+            main(list(job.words))
     return out
 
 
 @pytest.fixture
-def copy(swept, tmp_path, monkeypatch):
-    shutil.copytree(swept, tmp_path / "copy", dirs_exist_ok=True)
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "copy"
+def copy(swept, tmp_path):
+    return shutil.copytree(swept, tmp_path / "copy")
 
 
 def plan(folder: Path, changes=(), kept=(), data=None, others=(), out=None):
@@ -357,7 +353,7 @@ def test_seeds_may_have_individual_datasets(copy, tmp_path):
         assert ({job.section for job in done}, len(done)) == ({"finetune"} if number else set(), number)
 
 
-def test_vd4rl_grid_uses_downloaded_datasets(tmp_path, capsys, own_cache):
+def test_vd4rl_grid_uses_downloaded_datasets(tmp_path, capsys):
     for task in ("walker_walk", "cheetah_run"):
         for quality in ("medium_expert", "expert"):
             write_fake_set(tmp_path / "vd4rl" / task / quality / "84px", [20, 25])
@@ -384,7 +380,7 @@ def test_runs_with_other_exogenous_images_do_not_match(tmp_path):
 
 
 @pytest.mark.parametrize(("quality", "name"), [('"mine"', "mine"), ("2", "2")])
-def test_user_defined_quality_is_used_if_present(tmp_path, capsys, own_cache, quality, name):
+def test_user_defined_quality_is_used_if_present(tmp_path, capsys, quality, name):
     text = GRID.partition("[finetune]")[0].replace('"expert"', quality) + "method = 'random'"
     (tmp_path / "grid.toml").write_text(text)
     words = [str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]

@@ -1,7 +1,6 @@
 """Plug-ins registered in a user's script that starts a sweep are available in its jobs."""
 
 import json
-import os
 import subprocess
 import sys
 from types import ModuleType
@@ -44,12 +43,11 @@ def run(tmp_path):
     write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25, 30])
     (tmp_path / "grid.toml").write_text(GRID)
     (tmp_path / "folder").mkdir()
-    environment = os.environ | {"VD4RL_POMDP_CACHE": str(tmp_path / "cache")}
 
     def command(last: str, *how: str, words="sweep run grid.toml --out runs --data data"):
         (tmp_path / "folder" / "own.py").write_text(FILE + last)
         line = [sys.executable, *(how or ["folder/own.py"]), *words.split()]
-        return subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        return subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
 
     return command
 

@@ -172,8 +172,7 @@ eval_clean = false
 """
 
 
-def test_grid_policies_train_as_stack_with_separate_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+def test_grid_policies_train_as_stack_with_separate_runs(tmp_path, capsys):
     write_fake_set(tmp_path / "out" / "data" / "walker_walk" / "expert", [20, 25])
     (tmp_path / "grid.toml").write_text(GRID)
     words = ["sweep", "run", str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out"), "--stack", "2"]

@@ -14,8 +14,7 @@ from vd4rl_pomdp.runs.results import read_run
         ("quick_navigation", ["method=no_history"], 2, "three_curtains/no_history/seed0"),
     ],
 )
-def test_testing_cell_runs_end_to_end(tmp_path, monkeypatch, capsys, grid, only, jobs, last):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+def test_testing_cell_runs_end_to_end(tmp_path, capsys, grid, only, jobs, last):
     words = ["sweep", "run", grid, "--testing", "--only", *only, "--out", str(tmp_path / "out")]
     main([*words, "--jobs", "2"])  # one thread per job: two threads stall when tests run in parallel
     assert f"all {jobs} jobs are finished" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Conformance checks of corruptions: pure functions of a stack and its key, equal in data and environment."""
+"""Conformance checks of corruptions: pure functions of a stack and its key."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ import torch
 from torch import Tensor
 
 from pretrain.config import PretrainConfig
-from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
-from vd4rl_pomdp.core.types import StepType, row_key
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.corruptions import (
     BatchCorruption,
     Corruption,
     CorruptionConfig,
     FrameDrop,
-    derive_keys,
     make_corruption,
 )
 from vd4rl_pomdp.corruptions.augmentation import random_shift
@@ -117,16 +115,6 @@ def emission_never_changes_a_row(name: str, **options: Any) -> None:
         claim(torch.equal(one(stacks(), row), other(stacks(), row)), "two runs with one seed saw different masks")
 
 
-def the_environment_shows_what_the_data_show(name: str, **options: Any) -> None:
-    """Row t of an episode gets the same corruption in a batch of data and in the environment."""
-    rows = row_key(torch.tensor([0, 0, 1, 1]), torch.tensor([5, 6, 0, 1]))
-    data = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 7)(stacks(4), rows)
-    environment, seed = _make(name, options), stream_seed(7, "corruption", "emission")
-    for i, (seen, row) in enumerate(zip(stacks(4), rows, strict=True)):
-        now = environment(seen[None], derive_keys(seed, row[None]))[0]
-        claim(torch.equal(now, data[i]), "a row looks different in the environment")
-
-
 def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> None:
     """The fast data path equals shifting the stacks and then corrupting them."""
     with TemporaryDirectory() as folder:
@@ -175,6 +163,5 @@ CHECKS: tuple[Check, ...] = (
     draws_depend_only_on_keys,
     dropped_frames_stay_dropped,
     emission_never_changes_a_row,
-    the_environment_shows_what_the_data_show,
     a_view_shows_shifted_then_corrupted_stacks,
 )

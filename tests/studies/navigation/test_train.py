@@ -7,9 +7,8 @@ import torch
 
 from pretrain.objectives import METHODS, Method
 from pretrain.train import Trainer
-from tests.helpers_data import fake_rows
+from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
 from vd4rl_pomdp.nn.objective import ActionOptions, InverseOptions, StateInverse
@@ -27,13 +26,6 @@ from vd4rl_pomdp.studies.navigation.train import (
     refitted_errors,
     train,
 )
-
-
-@pytest.fixture(autouse=True)
-def _cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.getbasetemp() / "maze-cache"))
-    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
-    torch.set_num_threads(1)
 
 
 def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
@@ -243,12 +235,10 @@ def test_invalid_navigation_settings_are_rejected(maze_set, tmp_path, changes, m
     ],
 )
 def test_unsuitable_datasets_are_rejected(tmp_path, attributes, lengths, size, physics_dim, message):
-    rows = fake_rows(lengths, action_dim=2, physics_dim=physics_dim)
-    rows["observation"] = np.zeros((sum(lengths), 3, size, size), np.uint8)
-    (tmp_path / "set").mkdir()
-    write_shard(tmp_path / "set" / "0.hdf5", rows, attributes)
+    folder = tmp_path / "set"
+    write_fake_set(folder, lengths, action_dim=2, physics_dim=physics_dim, noise=size, attributes=attributes)
     with pytest.raises(UserError, match=message):
-        train(smoke(tmp_path / "set", tmp_path / "run"))
+        train(smoke(folder, tmp_path / "run"))
 
 
 def test_mixer_and_paper_preset_match_the_paper():

@@ -19,7 +19,6 @@ from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.studies.navigation import collect, train
 from vd4rl_pomdp.studies.navigation.train import ErrorSums, MazeData, ProbedObjective
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 MAZE = MAZES["three_curtains"]
 UNEVEN = {"evaluation_windows": 5, "refit_windows": 7, "refit_steps": 3, "burn_in": 3}
 """Different numbers, in incomplete batches of 4 windows."""
