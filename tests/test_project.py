@@ -209,7 +209,9 @@ def test_wheel_contains_all_package_files_and_two_agents(tmp_path):
     with ZipFile(build_wheel(tmp_path)) as wheel:
         packed = {name for name in wheel.namelist() if ".dist-info/" not in name}
     there = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in _files(ROOT / package)}
-    assert packed == {name for name in there if not re.match(r"vd4rl_pomdp/agents/(cheetah_run|.*(/random|_seed\d))/", name)}
+    assert packed == {
+        name for name in there if not re.match(r"vd4rl_pomdp/agents/(cheetah_run|.*(/random|_seed\d))/", name)
+    }
     assert sum(name.endswith("/card.json") for name in packed) == 2
 
 

@@ -163,6 +163,13 @@ def test_built_folder_appears_complete_or_not_at_all(tmp_path):
         build(hidden)
 
 
+def test_built_folder_is_no_mount_point(tmp_path, monkeypatch):
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setattr("os.path.ismount", lambda path: Path(path) == tmp_path / "disk")
+    with pytest.raises(UserError, match="disk: is a mount point; choose a folder in it"):
+        build(tmp_path / "disk")
+
+
 def test_built_folder_may_be_a_link_and_replaces_nothing(tmp_path):
     out, link = fill(tmp_path / "deep" / "out"), tmp_path / "link"
     link.symlink_to(out)

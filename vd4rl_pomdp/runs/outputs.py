@@ -143,6 +143,8 @@ def built(out: Path) -> Iterator[Path]:
     with disk_errors(out):
         if absolute.is_dir() and os.listdir(absolute):
             raise UserError(f"{out}: is not empty; choose another --out")
+    if os.path.ismount(absolute):  # could not be replaced at the end
+        raise UserError(f"{out}: is a mount point; choose a folder in it")
     hidden = absolute.with_name(f".{absolute.name}.export")
     made = hidden / "new"
     with removing_if_empty(hidden, True), owned(hidden):
