@@ -66,6 +66,14 @@ def own_cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
+def compiled_anew(monkeypatch):
+    """Compile all functions again, so that a test on a GPU reaches compiled code. By default, a function that was
+    compiled for eight kinds of arguments silently runs eagerly for others."""
+    torch.compiler.reset()
+    monkeypatch.setattr("torch._dynamo.config.fail_on_recompile_limit_hit", True)
+
+
+@pytest.fixture
 def data(tmp_path) -> Path:
     """A small expert set of walker_walk."""
     return write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25, 30])
