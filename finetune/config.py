@@ -54,7 +54,8 @@ class FinetuneConfig(StageConfig):
     precision: Precision = "fp32"
     """Encoder precision: fp32, tf32 (GPU only) or bf16 autocast."""
     update_precision: Precision = "fp32"
-    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast except in last layers."""
+    """Precision of the algorithm's matrix products: fp32, tf32 (GPU only), or bf16 autocast except in last layers.
+    On a GPU this, not --precision, decides whether encoders that run during the updates use tf32."""
     eval_every: int = 50_000
     """Updates between evaluations; the final update is always evaluated."""
     eval_episodes: int = 10

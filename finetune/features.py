@@ -250,6 +250,11 @@ class ExactSampler(Sampler):
         self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
         self._starts = frozen.dataset.transition_rows
 
+    @property
+    def obstacle(self) -> str:
+        """Why a CUDA graph cannot capture `sample`, or ""."""
+        return "--views 0 reads the lengths of histories" if self._frozen.encoder.remembers else ""
+
     def sample(self) -> FeatureBatch:
         """The next batch. An encoder with memory reads all rows of a transition's history or window."""
         dataset = self._frozen.dataset

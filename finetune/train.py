@@ -13,7 +13,7 @@ import torch
 
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
-from finetune.features import StackedSampler
+from finetune.features import ExactSampler, StackedSampler
 from finetune.stack import Stack
 from finetune.trainer import FinetuneTrainer
 from vd4rl_pomdp.core.errors import UserError, flag_of
@@ -113,7 +113,9 @@ class Updates:
         bf16 = config.update_precision == "bf16"
         self._precise = torch.autocast(device.type, torch.bfloat16, bf16, cache_enabled=False)
         streams = [self._sampler.draws, counting.draws]
-        self._replay = Replay(self._update, device, streams, counting.period, [self._algorithm, counting])
+        obstacle = self._sampler.obstacle if isinstance(self._sampler, ExactSampler) else ""
+        trained = [self._algorithm, counting]
+        self._replay = Replay(self._update, device, streams, counting.period, trained, obstacle=obstacle)
         if self._replay.replays:
             counting.count_on(device)
         small = config.views > 0 and config.hidden_dim <= ONE_THREAD_UNITS and not self._stack

@@ -22,7 +22,7 @@ from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
 from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from vd4rl_pomdp.core.errors import refuse_outside
-from vd4rl_pomdp.core.hardware import pick_device, warn_of_busy_cores
+from vd4rl_pomdp.core.hardware import pick_device, set_products, warn_of_busy_cores
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.streams import random_stream, seed_networks
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY, DMCTask
@@ -123,6 +123,7 @@ class FinetuneTrainer:
 
         Labels, encoder and features are written into the run's folder, which must be owned.
         """
+        set_products(self.device, self.config.precision)
         config, card, run = self.config, self.card, self.run
         parts, what = self._pretrained.parts, "it was pretrained; pretrain it again"
         warn_of_other_code(config.encoder, vars(self._pretrained), parts, what)

@@ -67,6 +67,14 @@ def _cache_and_command(tmp_path_factory):
         yield
 
 
+@pytest.fixture
+def compiled_anew(monkeypatch):
+    """Compile all functions again, so that a test on a GPU reaches compiled code. By default, a function that was
+    compiled for eight kinds of arguments silently runs eagerly for others."""
+    torch.compiler.reset()
+    monkeypatch.setattr("torch._dynamo.config.fail_on_recompile_limit_hit", True)
+
+
 @pytest.fixture(scope="session")
 def data(tmp_path_factory) -> Path:
     """A small expert set of walker_walk, shared by all tests."""

@@ -1,5 +1,6 @@
 import importlib
 import json
+import os
 
 import pytest
 
@@ -7,6 +8,7 @@ from vd4rl_pomdp.bench import gpu, processes
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError, WorkerDiedError
 from vd4rl_pomdp.runs.files import flatten
+from vd4rl_pomdp.runs.replay import EAGER_VARIABLE
 
 
 @pytest.fixture
@@ -46,6 +48,33 @@ def test_failed_measurement_does_not_stop_the_others(in_process, monkeypatch, ca
     assert results["mik+a"] == results["evaluation"] == {"ms": 1.0}
     gpu_lines = capsys.readouterr().err
     assert "RuntimeError" in gpu_lines
+
+
+def test_results_survive_if_memory_cannot_be_freed(in_process, monkeypatch):
+    for name in ("encoding", "measured", "stacked", "peer", "encoders_at_once", "evaluation"):
+        monkeypatch.setattr(gpu, name, lambda *_: {"ms": 1.0})
+    freed = []
+
+    def free(device):
+        freed.append(device)
+        if len(freed) > 1:
+            raise RuntimeError("captures underway")
+
+    monkeypatch.setattr(gpu, "free", free)
+    results = gpu.gpu_bench("cpu", quick=True)
+    assert results["encoding"] == {"ms": 1.0}
+    assert results["acro"] == {"failed": "captures underway"}
+
+
+def test_eager_steps_are_never_measured_as_replayed(monkeypatch):
+    seen = []
+    for name in ("encoding", "peer", "evaluation", "on_features", "end_to_end", "next_step"):
+        monkeypatch.setattr(gpu, name, lambda *_: {})
+    for name in ("milliseconds", "encoders_at_once"):
+        monkeypatch.setattr(gpu, name, lambda *_: seen.append(os.environ.get(EAGER_VARIABLE)) or 1.0)
+    gpu.gpu_bench("cpu", quick=True)
+    algorithms, drq_bc, methods = 4 * ["1", "0"], ["1", "0"], 2 * ["1", "0"]
+    assert seen == [*algorithms, "0", *drq_bc, *methods, "0"]
 
 
 def test_full_gpu_benchmark_needs_a_gpu():

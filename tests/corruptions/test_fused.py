@@ -1,6 +1,7 @@
 """The fused single pass of a GPU against the line-by-line implementation of a CPU."""
 
 import shutil
+import warnings
 from functools import partial
 
 import pytest
@@ -107,8 +108,27 @@ def test_compile_failure_warns_once(monkeypatch, capsys):
     assert capsys.readouterr().err.count("is not compiled, which is slower: no compiler") == 1
 
 
+def test_compiler_advises_no_other_precision(monkeypatch, recwarn):
+    def compiled(function):
+        def call(x):
+            warnings.warn("TensorFloat32 tensor cores for float32 matrix multiplication available", stacklevel=1)
+            return function(x)
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", compiled)
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+    assert int(hardware.compiled_on_gpu(lambda x: 2 * x)(torch.tensor(3))) == 6
+    assert not [one for one in recwarn if "TensorFloat32" in str(one.message)]
+
+
+GPU_CASES = [("none", {}), ("patch", OPTIONS[2]), ("patch+zero_frames", OPTIONS[1]), DROPS[1], DROPS[3]]
+"""Few, since compiling takes long."""
+
+
 @pytest.mark.gpu
-@pytest.mark.parametrize(("name", "options"), CASES)
+@pytest.mark.usefixtures("compiled_anew")
+@pytest.mark.parametrize(("name", "options"), GPU_CASES)
 def test_gpu_observations_equal_cpu_observations(dataset, capsys, name, options):
     config = CorruptionConfig.fill({"corruption": name} | options)
     for settings in SETTINGS:
@@ -130,8 +150,9 @@ def samplers(dataset: Dataset, config: CorruptionConfig) -> list[WindowSampler |
 
 
 @pytest.mark.gpu
+@pytest.mark.usefixtures("compiled_anew")
 @pytest.mark.parametrize("mode", ["resample", "emission"])
-def test_gpu_batches_equal_cpu_batches_without_synchronising(dataset, mode):
+def test_gpu_batches_equal_cpu_batches_without_synchronising(dataset, capsys, mode):
     """Keys advance within the graph: each replay samples the next batch."""
     config, steps = CorruptionConfig.of("patch+zero_frames", mode, patch_size=5), 12
     expected = [[s.sample().to("cpu").replace() for _ in range(steps)] for s in samplers(dataset, config)]
@@ -157,6 +178,7 @@ def test_gpu_batches_equal_cpu_batches_without_synchronising(dataset, mode):
                 torch.cuda.set_sync_debug_mode("default")
                 found.append({name: value.cpu() for name, value in held[0].items()})
             assert replay.replays
+            assert "not compiled" not in capsys.readouterr().err
             for batch, other in zip(batches, found, strict=True):
                 for name in batch:
                     torch.testing.assert_close(other[name], batch[name], rtol=1e-6, atol=1e-6)

@@ -57,6 +57,15 @@ def test_exact_batches_resume_bit_exactly(encoder, data, tmp_path, monkeypatch):
     assert not (whole / "features.npy").exists()
 
 
+def test_precision_holds_while_views_are_encoded(encoder, data, tmp_path, monkeypatch):
+    order = []
+    encode = trainer.encode_views
+    monkeypatch.setattr(trainer, "set_products", lambda device, precision: order.append(precision))
+    monkeypatch.setattr(trainer, "encode_views", lambda *given: order.append("encode") or encode(*given))
+    run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **BRIEF, precision="tf32"))
+    assert order == ["tf32", "encode"]
+
+
 def test_view_seed_fixes_features_but_not_networks(encoder, data, tmp_path):
     def trained(name: str, **seeds: int) -> dict[str, torch.Tensor]:
         run = run_finetune(smoke_finetune(encoder, data, tmp_path / name, **BRIEF, **seeds))

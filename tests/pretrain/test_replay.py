@@ -100,6 +100,7 @@ def distance(one: tuple[Trainer, list], other: tuple[Trainer, list]) -> list[flo
 
 
 @pytest.mark.gpu
+@pytest.mark.usefixtures("compiled_anew")
 @pytest.mark.parametrize("method", TRAINED)
 def test_cuda_graph_deviates_only_by_rounding(
     states: Path, monkeypatch: pytest.MonkeyPatch, method: str, capsys: pytest.CaptureFixture[str]

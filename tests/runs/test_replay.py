@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +16,8 @@ from tests.recording import record
 from vd4rl_pomdp.core.streams import BLOCK, RandomStream
 from vd4rl_pomdp.nn.adam import Adam, set_learning_rate
 from vd4rl_pomdp.nn.heads import move_target
-from vd4rl_pomdp.runs.replay import Replay
+from vd4rl_pomdp.runs import replay as module
+from vd4rl_pomdp.runs.replay import EAGER_VARIABLE, Replay
 
 CPU = torch.device("cpu")
 
@@ -134,6 +138,63 @@ def test_steps_that_cannot_be_captured_run_eagerly_with_one_warning(
     stderr = capsys.readouterr().err
     assert stderr.count("warning") == 1
     assert [word for word in reason.split("|") if word in stderr]
+
+
+def test_failed_capture_raises_where_eager_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(EAGER_VARIABLE, "0")
+    with pytest.raises(RuntimeError, match="reads a value"):
+        train(Reads(), 40, record)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_failed_capture_ends_its_pool_and_names_the_first_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], known: bool
+) -> None:
+    """`known`: whether this PyTorch has the private function that ends the pool."""
+    underway, ended = list[bool](), list[tuple]()
+
+    @contextmanager
+    def graph(*_: Any, **__: Any) -> Iterator[None]:
+        underway.append(True)
+        try:
+            yield
+        finally:
+            underway.clear()
+            raise RuntimeError("the capture is invalid")
+
+    def step(turn: int) -> dict[str, Tensor]:
+        if underway:
+            raise ValueError("a value is read")
+        return {"loss": torch.zeros(())}
+
+    monkeypatch.setattr(torch.cuda, "graph", graph)
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 7))
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", SimpleNamespace)
+    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *given: ended.append(given), raising=False)
+    if not known:
+        monkeypatch.delattr(torch._C, "_cuda_endAllocateToPool")
+    stream: Any = SimpleNamespace(device=torch.device("cuda:1"))
+    replay = Replay(step, CPU, capture=module._cuda_graphs(stream))
+    for _ in range(5):
+        replay(0)
+    assert not replay.replays
+    assert ended == [(1, (0, 7))] * known
+    assert capsys.readouterr().err.endswith("which is slower: a value is read\n")
+
+
+@pytest.mark.gpu
+def test_gpu_captures_after_a_failed_capture(capsys: pytest.CaptureFixture[str]) -> None:
+    x = torch.ones((), device="cuda")
+    failed = Replay(lambda turn: {"loss": x * x.item()}, x.device)
+    for _ in range(5):
+        failed(0)
+    assert not failed.replays
+    assert "warning" in capsys.readouterr().err
+    torch.cuda.empty_cache()
+    replay = Replay(lambda turn: {"loss": x + 1}, x.device)
+    assert [float(replay(0)["loss"]) for _ in range(5)] == [2.0] * 5
+    assert replay.replays
+    assert "warning" not in capsys.readouterr().err
 
 
 def test_eager_draws_do_not_accumulate_memory() -> None:

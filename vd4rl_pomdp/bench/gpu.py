@@ -104,13 +104,14 @@ def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
 
     def add(name: str, measure: Callable[[], dict[str, Any]]) -> None:
         try:
+            free(device)
             results[name] = results.get(name, {}) | measure()
         except Exception as error:  # the remaining measurements are still useful
             traceback.print_exc()
             results[name] = results.get(name, {}) | {"failed": first_line(error)}
-        free(device)
 
-    with tempfile.TemporaryDirectory() as name:
+    # 0: else a failed capture would be measured as replayed
+    with tempfile.TemporaryDirectory() as name, patch.dict(os.environ, {EAGER_VARIABLE: "0"}):
         folder = Path(name)
         dataset = synthetic_set(folder, size.episodes)[0].to(device)
         encoder = make_trainer(dataset, pretraining(folder, "mik+a", size)).objective.encoder.eval()

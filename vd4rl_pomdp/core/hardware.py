@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Callable
 from functools import wraps
@@ -146,6 +147,8 @@ def compiled_on_gpu(function: Callable[..., Any]) -> Any:
                 from torch._functorch import config  # imported here: loading the compiler takes seconds
 
                 config.donated_buffer = False  # else `retain_graph=True` fails
+                # advises a setting that `set_products` makes from --precision
+                warnings.filterwarnings("ignore", "TensorFloat32 tensor cores")
                 compiled = torch.compile(function)
             return compiled(*args)
         except torch.OutOfMemoryError:

@@ -11,7 +11,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -25,7 +25,7 @@ Logs = dict[str, Tensor]
 Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
 """Takes a function without running it; returns a function that replays it, and the tensor that then holds its
 result."""
-EAGER_VARIABLE = "VD4RL_POMDP_EAGER"  # if set to 1, no step is replayed
+EAGER_VARIABLE = "VD4RL_POMDP_EAGER"  # 1: no step is replayed; 0: a step that cannot be captured raises
 WARM_UP = 3  # eager steps per turn before capture: libraries pick kernels and optimisers create their state
 
 
@@ -40,6 +40,7 @@ class Replay:
         period: int = 1,
         trained: Sequence[Any] = (),
         capture: Capture | None = None,
+        obstacle: str = "",
     ) -> None:
         """See the class.
 
@@ -50,12 +51,13 @@ class Replay:
             period: steps after which the Python control flow repeats, e.g. 2 if every second step trains the actor.
             trained: objects that the step changes; replay requires that Python numbers in them stay constant.
             capture: how to capture; None: CUDA graphs on a GPU, nothing elsewhere.
+            obstacle: why the step cannot be captured, if that is known.
         """
         self._step, self._streams, self._period, self._trained = step, streams, period, trained
         self._side = torch.cuda.Stream(device) if device.type == "cuda" else None
         if capture is None and self._side is not None and os.environ.get(EAGER_VARIABLE) != "1":
             capture = _cuda_graphs(self._side)
-        self._capture = capture
+        self._capture, self._obstacle = capture, obstacle
         self._eager = 0
         self._steps: dict[int, tuple[Callable[[], None], list[str], Tensor]] = {}
         """By turn: its replay function, and the names and tensor of its scalars."""
@@ -94,6 +96,8 @@ class Replay:
                 self._before = python_state(self._trained)
             return False
         try:
+            if self._obstacle:
+                raise RuntimeError(self._obstacle)
             if changed := changed_in(self._before, python_state(self._trained)):
                 raise RuntimeError(f"{changed} changes from step to step")
             for stream in self._streams:
@@ -101,11 +105,16 @@ class Replay:
             for each in range(self._period):
                 self._steps[each] = self._captured(each)
         except Exception as error:  # any failure: run eagerly instead
+            if os.environ.get(EAGER_VARIABLE) == "0":
+                raise
+            cause: BaseException = error
+            while cause.__context__ is not None:  # ending a failed capture raises, too
+                cause = cause.__context__
             self._capture, self._steps = None, {}
             for stream in self._streams:
                 stream.one_by_one()
             line = "warning: steps are run one by one, not replayed as a CUDA graph, which is slower: "
-            print(line + first_line(error), file=sys.stderr, flush=True)
+            print(line + first_line(cause), file=sys.stderr, flush=True)
         return self._capture is not None
 
     def _captured(self, turn: int) -> tuple[Callable[[], None], list[str], Tensor]:
@@ -146,6 +155,12 @@ def _cuda_graphs(stream: torch.cuda.Stream) -> Capture:
             # thread_local: ignore GPU work of other threads
             with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
                 result = function()
+        except Exception:
+            # before torch 2.13, the allocator still records into the pool (github.com/pytorch/pytorch/pull/180395):
+            # empty_cache() and later captures would fail
+            with suppress(RuntimeError, AttributeError):
+                torch._C._cuda_endAllocateToPool(stream.device.index, pool)
+            raise
         finally:
             gc.enable()
         return graph.replay, result
