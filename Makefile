@@ -3,7 +3,6 @@
 .DEFAULT_GOAL := help
 
 BIN := .venv/bin
-export MUJOCO_GL ?= egl
 export LP_NUM_THREADS ?= 1
 
 help: ## Show this list

@@ -17,7 +17,7 @@ from finetune.features import ExactSampler, StackedSampler
 from finetune.stack import Stack
 from finetune.trainer import FinetuneTrainer
 from vd4rl_pomdp.core.errors import UserError, flag_of
-from vd4rl_pomdp.core.hardware import set_products
+from vd4rl_pomdp.core.hardware import set_products, warn_of_slow_bf16
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.runs.loop import in_step, save
@@ -51,6 +51,8 @@ def finetune_all(
         for one in trainers:
             owned.enter_context(one.run)
         unfinished = [one for one in trainers if not one.run.finished]
+        for one in unfinished[:1]:  # once for a stack, before its features are encoded
+            warn_of_slow_bf16(one.device, precision=one.config.precision, update_precision=one.config.update_precision)
         for one in unfinished:
             one.build()
         train(unfinished)

@@ -17,7 +17,7 @@ from pretrain.config import HiddenOptions, PretrainConfig, TrainingConfig, histo
 from pretrain.objectives import METHODS
 from pretrain.objectives.untrained import StateOptions
 from vd4rl_pomdp.core.errors import UserError, refuse_outside
-from vd4rl_pomdp.core.hardware import autocast, pick_device, set_products, warn_of_busy_cores
+from vd4rl_pomdp.core.hardware import autocast, pick_device, set_products, warn_of_busy_cores, warn_of_slow_bf16
 from vd4rl_pomdp.core.options import flat, settings_of
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.streams import RandomStream, random_stream, seed_networks
@@ -109,6 +109,7 @@ class Trainer:
             also_at: log a row of metrics after this step, too.
         """
         warn_of_busy_cores(self.device)
+        warn_of_slow_bf16(self.device, precision=self.config.precision)
         with training(run, self, title, steps, labels=labels) as loop:
             for step in loop:
                 loop.add(self.update())

@@ -13,6 +13,7 @@ from pretrain.train import pretrain as run_pretrain
 from tests.finetune.test_features import noise_set
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.core import hardware
 from vd4rl_pomdp.core.options import RUNTIME_FIELDS, flag_of
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.sweeps.driver import PATIENCE_S
@@ -92,6 +93,21 @@ def test_update_precision_changes_the_policy(encoder, data, tmp_path):
         return (run.path / "policy/model.safetensors").read_bytes()
 
     assert weights("fp32") != weights("bf16")
+
+
+def test_training_in_bf16_warns_where_the_cpu_has_no_kernels(encoder, data, tmp_path, monkeypatch, capsys):
+    def warned(kernels, precision):
+        monkeypatch.setattr(hardware, "bf16_kernels", lambda: kernels)
+        place = tmp_path / f"{kernels}_{precision}"
+        run_pretrain(smoke_pretrain(data, place / "pretrained", steps=1, precision=precision))
+        both = {"precision": precision, "update_precision": precision}
+        finetune(smoke_finetune(encoder, data, place / "tuned", updates=1, batch_size=4, eval_episodes=0, **both))
+        hardware.warn_of_slow_bf16(torch.device("cuda"), **both)
+        lines = [line for line in capsys.readouterr().err.splitlines() if "no bf16 kernels" in line]
+        return [line.partition("start again with ")[2] for line in lines]
+
+    assert warned(False, "bf16") == ["--precision fp32", "--precision fp32 --update-precision fp32"]
+    assert warned(True, "bf16") == warned(False, "fp32") == []
 
 
 def test_runs_page_names_the_flags_that_may_change():

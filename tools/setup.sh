@@ -12,9 +12,8 @@ if [ -z "${PYTHON:-}" ]; then
     [ ! -x "$VENV/bin/python" ] || PYTHON="$VENV/bin/python"
 fi
 STAMP="$VENV/.installed"
-export MUJOCO_GL="${MUJOCO_GL:-egl}"
 RENDER_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri)
-if [ "$MUJOCO_GL" = osmesa ]; then
+if [ "${MUJOCO_GL:-}" = osmesa ]; then
     RENDER_PACKAGES=(libosmesa6)
 fi
 
@@ -23,6 +22,10 @@ say() { printf '%s\n' "$*" >&2; }
 # Install Debian packages as root or with passwordless sudo; otherwise name them in one line and stop.
 install_debian() {
     local as_root=""
+    if ! command -v apt-get >/dev/null; then
+        say "setup: needs $*: install with your system's package manager, then re-run the same command"
+        exit 2
+    fi
     if [ "$(id -u)" -ne 0 ]; then
         if ! sudo -n true 2>/dev/null; then
             say "setup: please install $* (for example: sudo apt-get install $*), then re-run the same command"
@@ -44,7 +47,7 @@ install_slurm() {
 
 version() { "$1" -V 2>/dev/null || true; }
 
-wanted="$(cat pyproject.toml constraints.txt tools/setup.sh | sha256sum | cut -d' ' -f1) $(version "$PYTHON")"
+wanted="$(cat pyproject.toml constraints.txt tools/setup.sh | cksum) $(version "$PYTHON")"
 [ "${1:-}" != tests ] || install_slurm
 if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$wanted" ]; then
     exit 0
@@ -66,16 +69,16 @@ pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-
 pip_install -e ".[dev,navigation,policy,tracking,slurm,ray]"
 pip_install --no-deps dm-control # on Python 3.13 only this works; elsewhere it is installed already
 
-# Whether a task can be rendered here.
+# Whether a task can be rendered here; sets `failure`, the last line of its output.
 can_render() {
-    "$VENV/bin/python" -c 'from vd4rl_pomdp.core.tasks import TASKS
+    failure="$("$VENV/bin/python" -c 'from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs.make import make_env
-assert make_env(TASKS["walker_walk"]).reset(0).frame is not None' >/dev/null 2>&1
+assert make_env(TASKS["walker_walk"]).reset(0).frame is not None' 2>&1 | tail -n 1)"
 }
 if ! can_render; then
-    install_debian "${RENDER_PACKAGES[@]}"
+    ! command -v apt-get >/dev/null || install_debian "${RENDER_PACKAGES[@]}"
     if ! can_render; then
-        say "setup: rendering still fails with MUJOCO_GL=$MUJOCO_GL; try MUJOCO_GL=osmesa"
+        say "setup: rendering fails: ${failure##*UserError: }"
         exit 2
     fi
 fi

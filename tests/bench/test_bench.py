@@ -60,6 +60,13 @@ def test_training_benchmarks_use_the_selected_device(monkeypatch):
     assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 4]
 
 
+def test_bf16_has_no_goal_where_the_cpu_has_no_kernels(capsys):
+    for kernels in (True, False):
+        results = {"pretraining": {"bf16_over_fp32": 0.2}, "machine": {"bf16_kernels": kernels}}
+        suite.print_table(results, GOALS, "")
+        assert ("missed" in capsys.readouterr().out) == kernels
+
+
 def test_benchmark_against_jax(tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "BATCH", 4)
     dataset, _ = suite.synthetic_set(tmp_path, 1)

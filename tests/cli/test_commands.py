@@ -183,6 +183,19 @@ def test_messages_are_escaped_on_ascii_terminals():
     assert refused.stderr.startswith(b"error: \\u03b6: no such folder")
 
 
+WINDOWS = """
+import os, signal, sys, vd4rl_pomdp
+os.name, sys.modules["fcntl"] = "nt", None
+del signal.SIGHUP
+import vd4rl_pomdp.cli
+"""
+
+
+def test_windows_is_refused_in_one_line():
+    refused = subprocess.run([sys.executable, "-c", WINDOWS], capture_output=True, text=True)
+    assert (refused.returncode, refused.stderr) == (2, "error: Windows is not supported: use WSL\n")
+
+
 def test_printed_results_take_one_line_each(capsys):
     show({"shards": [f"{i}.hdf5" for i in range(100)], "render": {"mujoco": ["3.11.0"]}, "seconds": 0.123456789}, False)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]

@@ -367,6 +367,7 @@ def test_npz_round_trip_loses_only_physics(tmp_path, capsys):
     with np.load(tmp_path / "npz" / names[0]) as first:
         assert first["image"].shape == (20, 84, 84, 3)
         assert [first[key].nonzero()[0].tolist() for key in ("is_first", "is_last", "is_terminal")] == [[0], [19], []]
+    (tmp_path / "npz" / f"._{names[0]}").write_bytes(b"\0\5\x16\7")  # as macOS writes it
     main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "cheetah_run")])
     assert_equal_rows(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
 

@@ -86,3 +86,16 @@ def test_machine_names_the_gpu_in_use(monkeypatch, device, named):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda used: f"card {used.index}")
     assert machine(device)["gpu"] == named
+
+
+def test_machine_names_processors_of_arm(tmp_path, monkeypatch):
+    cores = [f"processor\t: {part}\nCPU implementer\t: 0x41\nCPU part\t: {part}\n" for part in ("0xd40", "0xd05")]
+    (tmp_path / "cpuinfo").write_text("\n".join(cores))
+    monkeypatch.setattr(provenance, "_CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    assert machine("cpu")["processor"] == "aarch64 0x41/0xd40"
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nmodel name\t: Some CPU\nmodel name\t: Other\n")
+    assert machine("cpu")["processor"] == "Some CPU"
+    monkeypatch.setattr("platform.system", lambda: "Darwin")
+    monkeypatch.setattr(subprocess, "run", lambda words, **_: subprocess.CompletedProcess(words, 0, "Apple M2 Pro\n"))
+    assert machine("cpu")["processor"] == "Apple M2 Pro"

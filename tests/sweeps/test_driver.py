@@ -367,6 +367,13 @@ def test_moved_plan_is_readable_but_not_executed(tmp_path, monkeypatch, capsys):
     main(["sweep", "retry", "moved"])
 
 
+def test_hidden_files_are_no_plans(tmp_path):
+    plan = keep_plan(tmp_path, job(tmp_path, "one"))
+    (tmp_path / "sweep" / "plans" / "._plan.json").write_bytes(b"\0\5\x16\7")  # as macOS writes it
+    folder = SweepFolder(tmp_path)
+    assert (folder.plans(), folder.jobs_of_others("")) == ([plan], plan.jobs)
+
+
 @pytest.mark.parametrize("text", ["[{", "{}", "[3]", '{"made_in": "/", "out": "runs", "program": [], "jobs": [{}]}'])
 def test_damaged_plan_is_rejected(tmp_path, text):
     keep_plan(tmp_path, job(tmp_path, "one"))

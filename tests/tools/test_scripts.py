@@ -33,6 +33,39 @@ def test_setup_recreates_environment_for_another_python(tmp_path):
     assert made_after(**other) == made_after() == ["11", "12"]
 
 
+def test_setup_needs_neither_debian_nor_gnu(tmp_path):
+    """On a path with a few POSIX tools and a fake interpreter, which renders nothing while `broken` exists."""
+    (tmp_path / "tools").mkdir()
+    (tmp_path / "bin").mkdir()
+    shutil.copy(SCRIPTS / "setup.sh", tmp_path / "tools")
+    for name in ("pyproject.toml", "constraints.txt", "broken"):
+        (tmp_path / name).touch()
+
+    def program(name, text):
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+
+    def setup():
+        environment = {"PATH": str(tmp_path / "bin")}
+        done = subprocess.run([bash, "tools/setup.sh"], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        return done.returncode, done.stderr.splitlines()[-1:]
+
+    bash = shutil.which("bash")
+    for name in ("cat", "cksum", "cp", "dirname", "mkdir", "tail"):
+        program(name, f'exec {shutil.which(name)} "$@"')
+    means = "install with your system's package manager, then re-run the same command"
+    assert setup() == (2, [f"setup: needs python3 python3-venv: {means}"])
+    fails = "*make_env*) [ ! -e broken ] || { echo x.UserError: cannot render >&2; exit 1; }"
+    makes = '"-m venv"*) mkdir -p .venv/bin; cp bin/python3 .venv/bin/python'
+    program("python3", f'case "$*" in -V) echo Python 3.11.0;; {makes};; {fails};; esac')
+    assert setup() == (2, ["setup: rendering fails: cannot render"])
+    (tmp_path / "broken").unlink()
+    assert setup()[0] == 0
+    assert setup() == (0, []), "the stamp is current"
+    (tmp_path / "constraints.txt").write_text("numpy==2.0.0")
+    assert setup() == (0, ["setup: installing Python packages (a few minutes the first time)"])
+
+
 def test_generated_tables_are_current(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
     script = importlib.import_module("page_tables")

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
+if os.name == "nt":  # before the imports that fail there
+    print("error: Windows is not supported: use WSL", file=sys.stderr)
+    sys.exit(2)
+
 import importlib
 import io
 import multiprocessing
-import os
 import re
 import signal
-import sys
 from collections.abc import Sequence
 from typing import NamedTuple, TextIO
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.errors import UserError, first_line
+from vd4rl_pomdp.core.errors import UserError, first_line, flag_of
 
 Precision = Literal["fp32", "tf32", "bf16"]
 """Precision of matrix products. tf32: on a GPU, inputs have 10 mantissa bits, as is JAX's default; elsewhere fp32."""
@@ -62,6 +62,22 @@ def warn_of_busy_cores(device: torch.device) -> None:
         print(
             f"warning: other programs use {min(others, cores)} of {cores} cores, so {threads} threads that wait for "
             "each other can be many times slower than one: interrupt, and resume with OMP_NUM_THREADS=1",
+            file=sys.stderr,
+        )
+
+
+def bf16_kernels() -> bool:
+    """Whether oneDNN has bf16 kernels for this CPU; without them PyTorch's take several times as long as fp32."""
+    return bool(torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+def warn_of_slow_bf16(device: torch.device, **precisions: Precision) -> None:
+    """Warn before training in bf16 on a CPU that is faster in fp32; `precisions` by the name of their setting."""
+    flags = " ".join(f"{flag_of(name)} fp32" for name, precision in precisions.items() if precision == "bf16")
+    if flags and device.type == "cpu" and not bf16_kernels():
+        print(
+            "warning: this CPU has no bf16 kernels, so bf16 is several times slower than fp32: start again with "
+            f"{flags}",
             file=sys.stderr,
         )
 

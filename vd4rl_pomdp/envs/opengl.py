@@ -20,7 +20,7 @@ from vd4rl_pomdp.core.errors import UserError, first_line
 
 _TOO_LATE = "MUJOCO_GL" not in os.environ and bool({"dm_control._render", "mujoco.gl_context"} & sys.modules.keys())
 """Whether another import has already chosen how to render, by its own default."""
-os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows have only glfw
+os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS has only glfw
 os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales with processes, not with threads
 warnings.filterwarnings("ignore", module="glfw")  # it warns if there is no screen; rendering then raises an error
 

@@ -72,20 +72,35 @@ def _git(root: Path, *words: str) -> str:
     return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
 
+_CPUINFO = Path("/proc/cpuinfo")
+
+
+def _processor() -> str:
+    """The processor's model; on ARM Linux, which names none, the implementer and part of its first core."""
+    if platform.system() == "Darwin":
+        words = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
+        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+    stated: dict[str, str] = {}
+    if _CPUINFO.exists():
+        for line in _CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            stated.setdefault(name.strip(), value.strip())
+    if "model name" not in stated and {"CPU implementer", "CPU part"} <= stated.keys():
+        return f"{platform.machine()} {stated['CPU implementer']}/{stated['CPU part']}"
+    return stated.get("model name") or platform.processor() or platform.machine()
+
+
 def machine(device: str = "auto") -> dict[str, Any]:
     """Hardware of a run on a device: processor, cores, memory and GPU. No host or user names."""
     import torch  # here, since setup.py loads this file where nothing is installed
 
-    from vd4rl_pomdp.core.hardware import pick_device
+    from vd4rl_pomdp.core.hardware import bf16_kernels, pick_device
 
     used = pick_device(device)
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return {
-        "processor": models[0] if models else platform.processor() or platform.machine(),
+        "processor": _processor(),
         "cores": os.cpu_count(),
-        "bf16_kernels": torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported(),
+        "bf16_kernels": bf16_kernels(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "gpu": torch.cuda.get_device_name(used) if used.type == "cuda" else None,
         "system": platform.system(),

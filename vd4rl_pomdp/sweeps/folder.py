@@ -88,9 +88,12 @@ class SweepFolder:
                 )
         return list(plans.values())
 
+    def _plan_files(self) -> list[Path]:
+        return sorted((self.path / "plans").glob("[!.]*.json"))  # macOS writes ._x.json beside x.json
+
     def _plans(self, name: str) -> dict[Path, Plan]:
         """See `plans`; by file."""
-        paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
+        paths = [path for path in self._plan_files() if name in ("", path.stem)]
         if not paths:
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
 
@@ -106,8 +109,7 @@ class SweepFolder:
 
     def jobs_of_others(self, name: str) -> list[Job]:
         """The jobs of all plans except `name`, as written."""
-        paths = sorted((self.path / "plans").glob("*.json"))
-        return [job for path in paths if path.stem != name for job in read_plan(path).jobs]
+        return [job for path in self._plan_files() if path.stem != name for job in read_plan(path).jobs]
 
     def add(self, row: Row) -> None:
         """Append the row of an attempt; DiskFullError if it could not be written whole."""

@@ -108,7 +108,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 def _episodes(pq: Any, folder: Path, info: dict[str, Any]) -> dict[str, list[Any]]:
     """Columns of meta/episodes, which locate each episode, in order."""
-    index = sorted(folder.glob("meta/episodes/*/*.parquet"))
+    index = sorted(folder.glob("meta/episodes/*/[!.]*.parquet"))  # macOS writes ._x beside x
     names = [name for file in index[:1] for name in pq.read_schema(file).names if not name.startswith("stats/")]
     tables = [pq.read_table(file, columns=names) for file in index]
     table = _arrow().concat_tables(tables).sort_by("episode_index").to_pydict() if index else {"length": []}

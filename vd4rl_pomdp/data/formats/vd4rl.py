@@ -47,7 +47,7 @@ def read_shards(path: str, picture: str | None = None) -> SourceSet:
 def read_npz(path: str, picture: str | None = None) -> SourceSet:
     """Open a folder of episodes, one file each, ordered by name."""
     folder = Path(path)
-    files = sorted(folder.glob("*.npz"))
+    files = sorted(folder.glob("[!.]*.npz"))  # macOS writes ._x.npz beside x.npz
     if not files:
         raise UserError(f"{folder}: holds no .npz episodes; name the folder that holds them, such as TASK/QUALITY/64px")
     with _opened(files[0]) as first:
