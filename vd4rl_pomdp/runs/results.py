@@ -235,13 +235,14 @@ def _check(run: Result) -> None:
     if "seed" not in config or not isinstance(stage, str):
         raise TypeError(f"its record holds no settings, or its stage is {stage!r}")
     texts = [part.get(name, {}) for part in (run.record, run.origin) for name in ("inputs", "plugins", "sources")]
-    for part, kinds in (
+    typed: list[tuple[dict[str, Any], dict[str, Any]]] = [
         (run.record, {"inputs": dict, "collection": dict | None, "command": str, "plugins": dict, "sources": dict}),
         (config, {"data": str | None}),
         (run.encoder, {"corruption": dict | None, "data": str, "settings": dict | None}),
         (run.files.get("labels", {}), dict.fromkeys(LABELS, str) | {"seed": int}),
         *((part, dict.fromkeys(part, str)) for part in texts),
-    ):
+    ]
+    for part, kinds in typed:
         for name, kind in kinds.items():
             if name in part and not fits(part[name], kind):
                 raise TypeError(f"its {name} is {part[name]!r}")
