@@ -22,7 +22,7 @@ from tests.helpers_report import pretraining
 from tests.helpers_stages import smoke_finetune
 from tests.runs.results.test_results import whole_run
 from vd4rl_pomdp import load_agent
-from vd4rl_pomdp.agents import FILES, SHIPPED, shipped
+from vd4rl_pomdp.agents import FILES, SHIPPED, checksums, shipped
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
@@ -30,7 +30,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.report.films import side_by_side
-from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import read_run
 
@@ -199,3 +199,24 @@ def test_batches_of_observations_are_rejected(name):
     with pytest.raises(UserError, match="agents read uint8 pixels from 0 to 255, not torch"):
         agent.act(obs / np.float32(255))
     assert agent.act(obs).shape == (6,)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("encoder", lambda config: config.update(pretrain="method"), "its files do not match card.json"),
+        ("encoder", lambda config: config["pretrain"].update(corruption={}), r"\(config.json: no 'corruption'\)"),
+        ("policy", lambda config: config.update(hidden=10**6), "not a policy folder .*loading state_dict for Policy"),
+    ],
+)
+def test_agents_of_odd_configs_are_rejected(tmp_path, name, change, message):
+    folder = shutil.copytree(SHIPPED / shipped()[0], tmp_path / "agent")
+    config = read_json(folder / name / "config.json")
+    change(config)
+    write_json(folder / name / "config.json", config)
+    card = read_json(folder / "card.json") | {"sha256": checksums(folder)}
+    if config.get("pretrain") and "corruption" in config["pretrain"]:
+        card["corruption"] = config["pretrain"]["corruption"]
+    write_json(folder / "card.json", card)
+    with pytest.raises(UserError, match=message):
+        load_agent(folder)

@@ -205,11 +205,27 @@ def test_invalid_listing_is_rejected(hub, encoder, tmp_path, change):
 
 def test_dataset_with_other_files_is_rejected(hub, data, tmp_path):
     push(data, SET)
-    listing = json.loads(hub.files(WHERE[SET])[LISTING])
-    listing["sha256"]["notes.txt"] = ""
-    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {LISTING: json.dumps(listing).encode()})
-    with pytest.raises(UserError, match=r"lab/set: its vd4rl_pomdp\.json is of another version or damaged"):
-        pull(SET, tmp_path / "new")
+    whole = json.loads(hub.files(WHERE[SET])[LISTING])
+    for name in ("notes.txt", "\x1b[31mnotes.md"):
+        listing = whole | {"sha256": whole["sha256"] | {name: ""}}
+        hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {LISTING: json.dumps(listing).encode()})
+        with pytest.raises(UserError, match=r"lab/set: its vd4rl_pomdp\.json is of another version or damaged"):
+            pull(SET, tmp_path / "new")
+
+
+def test_files_that_a_dataset_links_to_elsewhere_are_not_pushed(hub, data, tmp_path):
+    (tmp_path / "private.json").write_text("{}")
+    (data / "more.json").symlink_to(tmp_path / "private.json")
+    with pytest.raises(UserError, match=r"more\.json: links to a file outside .*expert; replace it by a copy"):
+        push(data, SET)
+    assert not hub.repos
+
+
+def test_dataset_files_with_brackets_are_pulled(hub, data, tmp_path):
+    (data / "returns[all].png").write_bytes(b"\x89PNG")
+    push(data, SET)
+    assert pull(SET, tmp_path / "new")
+    assert (tmp_path / "new" / "returns[all].png").read_bytes() == b"\x89PNG"
 
 
 def test_damaged_download_is_fetched_again(hub, encoder, tmp_path):

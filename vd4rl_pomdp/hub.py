@@ -7,6 +7,7 @@ Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import shutil
@@ -23,7 +24,7 @@ from huggingface_hub.utils import disable_progress_bars
 
 from vd4rl_pomdp import __version__, agents
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line
-from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.reading import inside, read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.data.folder import is_shard_name, read_set, shard_files, shard_paths, task_and_quality
 from vd4rl_pomdp.data.format import read_attributes
@@ -120,7 +121,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
         if os.path.ismount(folder):  # before the download, after which the folder could not be replaced
             raise UserError(f"{folder}: is a mount point; choose a folder in it")
         # Next to the folder, so that the final rename is atomic; its fixed name lets the next pull resume.
-        api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
+        api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*map(glob.escape, listing)])
     with disk_errors(folder):
         if wrong := _wrong(staged, listing):
             (staged / wrong[0]).unlink(missing_ok=True)
@@ -173,7 +174,9 @@ def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str
     listing = read_json(path)
     files = found if isinstance(found := listing.get("sha256"), dict) else {}
     kind = AGENT if (kind, listing.get("kind")) == (ENCODER, AGENT) else kind
-    plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in files)
+    plain = all(
+        Path(name).name == name and not name.startswith(".") and name != CARD and name.isprintable() for name in files
+    )
     plain = plain and all(is_shard_name(name) or Path(name).suffix in _BESIDE_SHARDS for name in files)
     fits = files.keys() == set(_FILES[kind]) if kind in _FILES else plain and any(map(is_shard_name, files))
     if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not fits:
@@ -193,7 +196,7 @@ def _checked(folder: Path, kind: str) -> list[Path]:
         return [folder / name for name in _FILES[kind]]
     shards = read_set(folder).shards
     kept = [p for p in folder.iterdir() if p.suffix in _BESIDE_SHARDS and not p.name.startswith(".")]
-    return sorted([*shards, *(path for path in kept if path.name not in (CARD, LISTING))])
+    return sorted([*shards, *(inside(folder, path) for path in kept if path.name not in (CARD, LISTING))])
 
 
 def _agent_card(folder: Path, repository: str, license: str) -> str:

@@ -86,3 +86,20 @@ def test_card_of_a_user_set_does_not_name_the_actor_of_its_quality(tmp_path):
     text = module.write_card(own).read_text()
     assert "actor" not in text
     assert "A published dataset, or one that records no origin." in text
+
+
+def test_card_replaces_links_instead_of_what_they_name(tmp_path):
+    folder = write_fake_set(tmp_path / "set")
+    (tmp_path / "mine").write_text("mine")
+    for name in ("card.md", "card.png", ".card.md.tmp"):
+        (folder / name).symlink_to(tmp_path / "mine")
+    write_card(folder)
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert not (folder / "card.md").is_symlink()
+
+
+@pytest.mark.parametrize(
+    "odd", [{"actor_sha256": "f0"}, {"imported": "minari"}, {"imported": {"id": 5}}, {"task": ["a"], "seed": {}}]
+)
+def test_cards_of_odd_attributes_are_written(tmp_path, odd):
+    assert write_card(write_fake_set(tmp_path / "set", attributes=odd)).read_text().startswith("# ")

@@ -1,4 +1,5 @@
 import errno
+import os
 from pathlib import Path
 
 import h5py
@@ -8,7 +9,7 @@ import pytest
 from tests.helpers_data import fake_rows, read_shard, write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.folder import shard_paths
-from vd4rl_pomdp.data.format import read_attributes, read_frames, write_shard
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, write_shard
 
 
 @pytest.fixture
@@ -231,5 +232,33 @@ def test_arrays_in_other_files_are_rejected(shard, tmp_path, kind):
             layout = h5py.VirtualLayout(value.shape, value.dtype)
             layout[...] = h5py.VirtualSource(other["reward"])
             file.create_virtual_dataset("reward", layout)
+    with pytest.raises(UserError, match=r"'(far|reward)' is stored in another file"):
+        read_shard(shard)
+
+
+def test_files_that_links_name_are_not_opened(shard, tmp_path):
+    os.mkfifo(tmp_path / "pipe")  # to open it would wait forever
+    with h5py.File(shard, "a") as file:
+        del file["reward"]
+        file["reward"] = h5py.ExternalLink(str(tmp_path / "pipe"), "reward")
     with pytest.raises(UserError, match="'reward' is stored in another file"):
         read_shard(shard)
+
+
+@pytest.mark.parametrize("key", ["observation", "reward"])
+def test_unwritten_arrays_are_rejected_before_memory_is_taken(shard, key):
+    with h5py.File(shard, "a") as file:
+        shape, dtype = file[key].shape[1:], file[key].dtype
+        del file[key]
+        file.create_dataset(key, (10**10, *shape), dtype, chunks=(50, *shape), compression="gzip")
+    with pytest.raises(UserError, match=rf"'{key}' has [\d,]+ bytes, of which 0 are stored"):
+        read_shard(shard)
+
+
+def test_constant_rows_are_not_taken_for_unwritten_ones(shard):
+    with h5py.File(shard, "a") as file:
+        del file["reward"]
+        zeros, options = np.zeros(10**7), {"compression": "gzip", "compression_opts": 9}
+        file.create_dataset("reward", data=zeros, chunks=(10**6,), **options)
+        assert file["reward"].id.get_storage_size() * 1000 < zeros.nbytes
+    assert read_frame_size([shard]) == 84

@@ -138,6 +138,19 @@ def test_minari_episode_cut_by_reset_is_truncated(minari, tmp_path):
     assert rows["discount"][-1] == 1
 
 
+def test_minari_arrays_in_other_files_are_not_read(minari, tmp_path):
+    export_set("minari", write_fake_set(tmp_path / "own", LENGTHS), tmp_path / "mine-v0")
+    (tmp_path / "others").mkdir()
+    for number, path in enumerate(("episode_1/observations", "episode_1")):
+        with h5py.File(tmp_path / "mine-v0" / "data" / "main_data.hdf5", "a") as file:
+            with h5py.File(tmp_path / "others" / f"{number}.h5", "w") as other:
+                file.copy(path, other, "moved")
+            del file[path]
+            file[path] = h5py.ExternalLink(str(tmp_path / "others" / f"{number}.h5"), "moved")
+        with pytest.raises(UserError, match=rf"main_data.hdf5: '{path}' is stored in another file"):
+            import_set("minari", str(tmp_path / "mine-v0"), tmp_path / "back")
+
+
 def corrupted_screen():
     env = Screen()
     env.spec = gymnasium.spec("vd4rl_pomdp/WalkerWalk-Patch16-v0")

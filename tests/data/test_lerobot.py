@@ -45,12 +45,20 @@ def edit_info(folder, change):
     (folder / "meta" / "info.json").write_text(json.dumps(info))
 
 
-def deepen(table):
-    """Replace the images by ones of 16 bits."""
+def png(pixels):
     file = io.BytesIO()
-    Image.fromarray(np.full((84, 84), 600, np.uint16)).save(file, "PNG")
-    images = arrow.array([{"bytes": file.getvalue(), "path": None}] * len(table), table.schema.field(PICTURE).type)
-    return table.set_column(table.schema.get_field_index(PICTURE), PICTURE, images)
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def showing(content):
+    """Replace all images by a file's content."""
+
+    def change(table):
+        images = arrow.array([{"bytes": content, "path": None}] * len(table), table.schema.field(PICTURE).type)
+        return table.set_column(table.schema.get_field_index(PICTURE), PICTURE, images)
+
+    return change
 
 
 def as_others_write(folder, scale=1.0, discount=False):
@@ -124,9 +132,14 @@ def test_lerobot_video_changes_only_images(tmp_path, capsys):
     rewrite(tmp_path / "out", lambda t: t.set_column(t.schema.get_field_index(column), column, later), INDEX)
     again = next(LEROBOT.read(str(tmp_path / "out"), None).read(0))[FRAMES_KEY]
     assert np.abs(again.astype(int) - rows[FRAMES_KEY]).max() <= 2
-    film.write_bytes(film.read_bytes()[:300])
+    whole = film.read_bytes()
+    film.write_bytes(whole[:300])
     with pytest.raises(UserError, match=r"out: episode 0: file-000.mp4 is damaged"):
         import_set("lerobot", str(tmp_path / "out"), tmp_path / "damaged")
+    film.with_name("other.mp4").write_bytes(whole)
+    film.write_text("ffconcat version 1.0\nfile other.mp4\n")
+    with pytest.raises(UserError, match=r"out: episode 0: file-000.mp4 is damaged or not a video"):
+        import_set("lerobot", str(tmp_path / "out"), tmp_path / "playlist")
 
 
 @pytest.mark.parametrize("discount", [False, True])
@@ -195,7 +208,10 @@ def info(change):
         (lambda out: (out / DATA).unlink(), "No such file"),
         (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
         (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "lacks rows"),
-        (lambda out: rewrite(out, deepen), "more than 8 bits per channel .*: convert it to 8 bits"),
+        (
+            lambda out: rewrite(out, showing(png(np.full((84, 84), 600, np.uint16)))),
+            "more than 8 bits per channel .*: convert it to 8 bits",
+        ),
         (info(lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
         (info(lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
         (info(lambda info: info.update(total_frames=50)), "has 54 of 50 frames"),
@@ -213,6 +229,35 @@ def test_damaged_lerobot_sets_are_rejected(exported, damage, message, tmp_path):
     with pytest.raises(UserError, match=message):
         import_set("lerobot", str(exported[0]), tmp_path / "back")
     assert not (tmp_path / "back").exists()
+
+
+def test_images_are_decoded_only_in_known_formats_and_sizes(exported, tmp_path, monkeypatch):
+    monkeypatch.setattr(Image.Image, "convert", None)  # what decodes: neither Ghostscript nor 300 MB may be reached
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 84 84\n%%EndComments\n%%EOF\n"
+    for content, message in ((eps, "cannot identify image"), (png(np.zeros((9000, 9000), bool)), "9000x9000 pixels")):
+        rewrite(exported[0], showing(content))
+        with pytest.raises(UserError, match=message):
+            import_set("lerobot", str(exported[0]), tmp_path / "back")
+
+
+@pytest.mark.parametrize("path", ["{folder}/other.parquet", "../other.parquet", "data/../../other.parquet"])
+def test_lerobot_files_outside_its_folder_are_not_read(exported, tmp_path, path):
+    (exported[0] / DATA).rename(tmp_path / "other.parquet")
+    edit_info(exported[0], lambda info: info.update(data_path=path.replace("{folder}", str(tmp_path))))
+    with pytest.raises(UserError, match=r"names the file .*other.parquet, outside its folder"):
+        import_set("lerobot", str(exported[0]), tmp_path / "back")
+
+
+def test_lerobot_sets_in_the_hubs_cache_are_imported(exported, tmp_path):
+    """Their files are links, snapshots/REVISION/data/... to ../../blobs/HASH."""
+    blobs, snapshot = tmp_path / "cache" / "blobs", tmp_path / "cache" / "snapshots" / "f00"
+    blobs.mkdir(parents=True)
+    for number, file in enumerate(sorted(path for path in exported[0].rglob("*") if path.is_file())):
+        link = snapshot / file.relative_to(exported[0])
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(file.rename(blobs / str(number)))
+    import_set("lerobot", str(snapshot), tmp_path / "back")
+    assert_equal_rows(rows_of_set(exported[1]), rows_of_set(tmp_path / "back"))
 
 
 def test_lerobot_video_of_odd_size_is_rejected(exported, tmp_path):

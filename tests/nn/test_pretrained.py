@@ -1,6 +1,7 @@
 """A frozen image model as frame encoder: loaded by name or folder; never trained, saved or downloaded."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -128,6 +129,15 @@ def test_missing_weights_are_never_initialised_randomly(tmp_path: Path):
     assert model(tmp_path / "lacking") is not None, "transformers loads it"
     with pytest.raises(UserError, match=r"its file lacks 1 weights, such as layernorm\.bias: download it again"):
         make("pretrained", model=str(tmp_path / "lacking"), model_size=SIZE)
+
+
+def test_models_with_code_of_their_own_are_rejected_without_a_question(model: Path, tmp_path: Path, monkeypatch):
+    folder = shutil.copytree(model, tmp_path / "model")
+    config = json.loads((folder / "config.json").read_text()) | {"model_type": "mine"}
+    (folder / "config.json").write_text(json.dumps(config | {"auto_map": {"AutoConfig": "code.Mine"}}))
+    monkeypatch.setattr("builtins.input", lambda question: pytest.fail(question))
+    with pytest.raises(UserError, match="cannot be loaded from this machine"):
+        make("pretrained", model=str(folder), model_size=SIZE)
 
 
 def test_clip_uses_its_vision_model_and_statistics(tmp_path: Path):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -206,6 +207,7 @@ def test_report_of_its_own_folder_keeps_certificates(tmp_path, monkeypatch):
     out, (run,) = Path("report"), find_results(["runs"])
     write_report([Path("runs")], out)
     about = {"data": "", "corruption": {}, "name": "patch", "verdict": "needs a memory", "why": "R2", "made": "now"}
+    about |= {"measured": {}, "budget": {}}
     keep_certificates(out, {run.certificate: about})
     for name in (out, tmp_path / "report"):
         assert list(write_report([name], out).summary["memory"]) == ["needs a memory (R2)"]
@@ -334,6 +336,37 @@ def test_methods_have_fixed_styles():
     assert {many["acro, m 4"], many["mine"]} == {len(figures.LOOKS), len(figures.LOOKS) + 1}
     looks = [str(figures.style(number)) for number in many.values()]
     assert len(set(looks)) == len(looks) >= 12
+
+
+ESCAPE = "\x1b[31mred"
+
+
+@pytest.mark.parametrize("words", [["report", "runs"], ["report", "compare", "runs", "runs"]])
+def test_names_send_no_escapes_to_the_terminal(tmp_path, capfd, drawn, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path / "runs/a", "acro", 0, {10: [2.0]}, labels={"corruption": ESCAPE, "quality": ESCAPE})
+    about = {"data": "", "corruption": {}, "name": "", "verdict": ESCAPE, "why": "", "made": "", "measured": {}}
+    (run,) = find_results(["runs"])
+    keep_certificates(tmp_path / "runs", {run.certificate: about | {"budget": {}}})
+    main([*words, "--out", "new"])
+    assert "\x1b" not in "".join(capfd.readouterr())
+    assert "\x1b" not in rejection(["report", f"runs/{ESCAPE}"])
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        {"clean": (2, 3, 8, 8), "corrupted": (1, 9, 8, 8), "return": (2,)},
+        {"clean": (0, 3, 8, 8), "corrupted": (0, 9, 8, 8), "return": (0,)},
+        {"clean": (2, 3, 8, 8), "corrupted": (2, 9, 8, 4), "return": (2,)},
+        {"clean": (2, 3, 8, 8), "corrupted": (2, 8, 8, 8), "return": (2,)},
+        {"clean": (2, 3, 8, 8), "corrupted": (2, 9, 8, 8), "return": (1,)},
+    ],
+)
+def test_films_of_arrays_that_do_not_fit_are_rejected(tmp_path, shapes):
+    np.savez(tmp_path / "film.npz", **{name: np.zeros(shape, np.uint8) for name, shape in shapes.items()})
+    with pytest.raises(UserError, match=r"film.npz: cannot be read \(its arrays have other shapes\)"):
+        films.read_film(tmp_path / "film.npz")
 
 
 def test_films_are_read_once_and_limited_by_size(tmp_path, monkeypatch):

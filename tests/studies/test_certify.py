@@ -109,6 +109,7 @@ def test_missing_certificate_is_reported(tmp_path, monkeypatch, capsys):
     for method in ("acro", "mik+a"):
         describe(write_run(tmp_path / "runs" / method, method, 0, {10: [20.0]}), {}, data="f00")
     certificate = {"data": "f00", "corruption": {}, "name": "patch", "verdict": NEEDS, "why": "it does", "made": "2026"}
+    certificate |= {"measured": {}, "budget": {}}
     hidden = {"corruption": "patch", "patch_size": 16}
     for data, corruption in (("f01", hidden), ("f00", hidden | {"patch_size": 24})):
         keep_certificates(tmp_path / "runs", {certificate_id(data, corruption): certificate})

@@ -396,6 +396,13 @@ def test_user_defined_quality_is_used_if_present(tmp_path, capsys, quality, name
     assert GridMembers("grid", cells).among([run]) == [run]
 
 
+@pytest.mark.parametrize("quality", ["", ".", "..", "../../mine", "/mine"])
+def test_qualities_that_are_no_folder_names_are_rejected(tmp_path, quality):
+    (tmp_path / "grid.toml").write_text(GRID.replace('"expert"', f'"{quality}"'))
+    with pytest.raises(UserError, match=f"collect has the quality '{quality}', which is no name of a folder"):
+        plan(tmp_path)
+
+
 def test_two_datasets_of_one_name_are_rejected(tmp_path):
     """A shared preset decides a maze dataset's size, its folder's name does not show it."""
     blocks = "".join(f'[[block]]\npreset = "{preset}"\n' for preset in ("smoke", "cpu"))

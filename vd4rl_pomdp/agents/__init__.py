@@ -106,7 +106,9 @@ def find_agent(name: Path | str) -> tuple[Path, dict[str, Any]]:
     with damaged(folder / CARD, "its budget has no pretraining", "use another copy"):
         own |= {"seed": None} | card["budget"]["pretraining"]
     about = read_json(folder / FILES[0]).get("pretrain", {}) if card.get("sha256") == checksums(folder) else {}
-    if not about or any(about[name] not in ("", value) for name, value in own.items() if name in about):
+    if not (about and isinstance(about, dict)) or any(
+        about[name] not in ("", value) for name, value in own.items() if name in about
+    ):
         raise UserError(f"{folder}: its files do not match {CARD}; use another copy")
     return folder, card
 

@@ -9,6 +9,7 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.core.text import one_line
 from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -102,7 +103,7 @@ def play(
     lines += [(f"{names[0]} less {name}", returns[0] - others) for name, others in lines[1:]]
     for name, values in lines:
         low, high = mean_interval(values) or (None, None)
-        print(f"  {name:<38} {with_interval(values.mean(), low, high, 0)}")
+        print(f"  {one_line(name):<38} {with_interval(values.mean(), low, high, 0)}")
     if film:
         from vd4rl_pomdp.report.films import side_by_side
 

@@ -9,6 +9,7 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.text import one_line
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.sweeps.grid import load_grid, narrow
 
@@ -44,7 +45,7 @@ def report(
     written = page.write_report(runs, out, choice)
     page.print_summary(written)
     for sentence in written.unlike:
-        print(f"warning: {sentence}", file=sys.stderr)
+        print(f"warning: {one_line(sentence)}", file=sys.stderr)
     print(f"report: {written.page}")
 
 
@@ -96,7 +97,7 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
 
     runs, wrong = verify_results(folder)
     wrong += contradictions(folder)
-    print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
+    print("\n".join([*map(one_line, wrong), f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
     if replay is not None:
         from finetune import evaluation  # loads OpenGL
 

@@ -15,6 +15,8 @@ from pathlib import Path
 from stat import S_ISDIR
 from typing import Any
 
+from vd4rl_pomdp.core.text import one_line
+
 TEMPORARY = 75
 """Exit code of failures that a retry may fix, EX_TEMPFAIL of sysexits.h. A sweep sees only a job's exit code: it
 retries after 75, but not after 2 (bad input)."""
@@ -96,13 +98,13 @@ def refuse_unknown(kind: str, name: object, choices: Iterable[object], remedy: s
 
 
 def first_line(error: BaseException) -> str:
-    """First line of an error's message, or its class name if there is none."""
-    return next(iter(str(error).splitlines()), type(error).__name__)
+    """First line of an error's message, or its class name if there is none; unprintable characters as `one_line`."""
+    return one_line(next(iter(str(error).splitlines()), type(error).__name__))
 
 
 def in_one_line(error: BaseException) -> str:
-    """An error's message on one line, with whitespace collapsed; "" if there is none."""
-    return " ".join(str(error).split())
+    """An error's message on one line, with whitespace collapsed and "?" for unprintable characters; "" if none."""
+    return one_line(" ".join(str(error).split()))
 
 
 def flag_of(name: str) -> str:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 T = TypeVar("T")
+PICTURES = ("PNG", "JPEG", "WEBP")
+"""Formats in which Pillow opens pictures: some of its others run programs, such as Ghostscript for EPS."""
 _PARSING = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, csv.Error, BadZipFile, zlib.error)
 """Exceptions that parsers raise on damaged files."""
 
@@ -28,6 +30,13 @@ def regular(path: Path) -> Path:
     """Return `path`; UserError for a folder, or for a pipe or device, which may never end."""
     if path.exists() and not path.is_file():
         raise UserError(f"{path}: is a folder, a pipe or a device, not a regular file; remove it or name another")
+    return path
+
+
+def inside(folder: Path, path: Path) -> Path:
+    """Return `path`, a file to copy from `folder`; UserError if it links to a file outside, which must not leak."""
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{path}: links to a file outside {folder}; replace it by a copy, or remove it")
     return path
 
 

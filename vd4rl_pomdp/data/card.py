@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
-from vd4rl_pomdp.core.text import code, markdown, plain, write_text
+from vd4rl_pomdp.core.text import code, markdown, plain
 from vd4rl_pomdp.data.folder import (
     PROVENANCE,
     StoredSet,
@@ -21,7 +21,7 @@ from vd4rl_pomdp.data.folder import (
     task_and_quality,
 )
 from vd4rl_pomdp.data.format import read_some_frames
-from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.files import read_json, write_bytes
 from vd4rl_pomdp.runs.results import NOT_CERTIFIED, certificate_in_words, read_certificates
 
 FILM_FRAMES = 10
@@ -75,13 +75,13 @@ def write_card(path: Path) -> Path:
     lines += [f"| {name} | {value} |" for name, value in _origin(path, attributes).items()]
     collected = "policy" in attributes[0]  # a user's dataset may share a quality's name
     how = HOW.get(names[1] or "", "") if collected else "A published dataset, or one that records no origin."
-    if source := dict(attributes[0].get("imported", {})):
-        how = f"Imported from {source.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in source.items()))}."
+    if isinstance(source := attributes[0].get("imported"), dict):
+        facts = ", ".join(f"{name} {value}" for name, value in source.items() if name != "format")
+        how = f"Imported from {markdown(str(source.get('format')))}: {markdown(facts)}."
     head = [f"# {markdown(title)}", "", how, "", "| | |", "|---|---|"]
     text = "\n".join([*head, *lines, "", "![Returns and a film strip](card.png)", ""])
-    with disk_errors(path / "card.md"):
-        (path / "card.png").write_bytes(_picture(title, returns, published, film))
-        write_text(path / "card.md", text)
+    write_bytes(path / "card.png", _picture(title, returns, published, film))
+    write_bytes(path / "card.md", text.encode(errors="backslashreplace"))
     return path / "card.md"
 
 
@@ -124,7 +124,9 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
     first = attributes[0]
     facts = {"seed": first.get("seed"), "render": first.get("render")}
     facts["noise added to actions, standard deviation"] = first.get("action_noise")
-    facts |= {f"actor {a['policy']}, SHA-256": a["actor_sha256"] for a in attributes if a.get("actor_sha256")}
+    facts |= {
+        f"actor {a.get('policy', 'unknown')}, SHA-256": a["actor_sha256"] for a in attributes if a.get("actor_sha256")
+    }
     record = path / PROVENANCE
     if first and record.exists():
         provenance = read_json(record)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +34,8 @@ _ATTRIBUTE = "vd4rl_pomdp"
 _BLOCK_ROWS = 1024
 _LARGEST = np.finfo(np.float32).max
 """Larger values would become infinite in float32."""
+_INFLATED = 1032
+"""Bytes that gzip can make of one."""
 _REPAIR = "download or collect it again"
 
 
@@ -167,13 +170,30 @@ def _open(path: Path) -> Iterator[h5py.File]:
 
 
 def _keys(path: Path, file: h5py.File) -> list[str]:
-    """Keys of the format that are in a file; UserError if one is missing, no array, or kept in another file."""
+    """Keys of the format that are in a file; UserError if one is missing, no array, not stored, or in another file."""
+    refuse_elsewhere(path, file)
     keys = [key for key in (FRAMES_KEY, *_ROW_KEYS) if key != "physics" or key in file]
     for key in keys:
         # not `file.get`, which hides a failing disk; HDF5's null datasets have no shape
         if key not in file or not isinstance(stored := file[key], h5py.Dataset) or stored.shape is None:
             raise UserError(f"{path}: has no {key!r}, so it is not a V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
-        elsewhere = stored.file.filename != file.filename  # by links
-        if elsewhere or stored.external or stored.is_virtual:  # a shard from elsewhere must not read other files here
-            raise UserError(f"{path}: {key!r} is stored in another file, which is not supported; {_REPAIR}")
+        size, held = math.prod(stored.shape) * stored.dtype.itemsize, stored.id.get_storage_size()
+        if size > held * _INFLATED + 2**20:  # such as rows that were never written
+            raise UserError(f"{path}: {key!r} has {size:,} bytes, of which {held:,} are stored; {_REPAIR}")
     return keys
+
+
+def refuse_elsewhere(path: Path, file: h5py.File) -> None:
+    """Raise UserError if anything in an HDF5 file is in another one, which is then never opened.
+
+    A data set from elsewhere must not make its reader read other files here.
+    """
+
+    def elsewhere(name: bytes) -> str | None:
+        kind = file.id.links.get_info(name).type  # h5py's own functions open what a link names
+        stored = file[name] if kind == h5py.h5l.TYPE_HARD else None
+        kept = isinstance(stored, h5py.Dataset) and (stored.external or stored.is_virtual)
+        return name.decode(errors="replace") if kept or kind == h5py.h5l.TYPE_EXTERNAL else None
+
+    if found := file.id.links.visit(elsewhere):
+        raise UserError(f"{path}: {found!r} is stored in another file, which is not supported; {_REPAIR}")

@@ -18,6 +18,7 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, TASKS, DMCTask
+from vd4rl_pomdp.core.text import one_line
 from vd4rl_pomdp.core.types import WINDOW
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import check_lengths
@@ -234,4 +235,4 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
 
 def _print(notes: Iterable[str]) -> None:
     for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {one_line(note)}", file=sys.stderr)

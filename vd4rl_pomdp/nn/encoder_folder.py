@@ -121,7 +121,10 @@ def read_record(folder: Path) -> EncoderRecord:
     try:
         config = parse_json(read_bytes(folder / CONFIG))
         parts = {"encoder": build(EncoderConfig, config["encoder"]), "pretrain": build(EncoderCard, config["pretrain"])}
-        return build(EncoderRecord, config | parts)
+        record = build(EncoderRecord, config | parts)
+        if not isinstance(name := record.pretrain.corruption["corruption"], str):
+            raise TypeError(f"corruption is {name!r}")
+        return record
     except UserError:
         raise
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -74,9 +74,12 @@ def load_policy(folder: Path | str) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
     folder = Path(folder)
     try:
+        shape, weights = read_json(folder / _SHAPE), read_tensors(folder / _WEIGHTS)
+        with torch.device("meta"):  # without memory, of which a few digits in its config.json may take any amount
+            Policy(**shape).load_state_dict(weights, assign=True)
         with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
-            policy = Policy(**read_json(folder / _SHAPE))
-        policy.load_state_dict(read_tensors(folder / _WEIGHTS))
+            policy = Policy(**shape)
+        policy.load_state_dict(weights)
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
         raise UserError(f"{folder}: {_NO_POLICY[0]} ({first_line(error)}); {_NO_POLICY[1]}") from error
     return policy.eval().requires_grad_(False)

@@ -107,6 +107,7 @@ def _load(name: str) -> Any:
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     local: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "dtype": torch.float32}
+    local["trust_remote_code"] = False  # else it asks whether to run code beside the model
     try:
         with fork_rng(devices=[]):  # the random initial weights are overwritten: keep the caller's RNG state
             model, report = transformers.AutoModel.from_pretrained(name, output_loading_info=True, **local)

@@ -9,7 +9,7 @@ import pandas as pd
 from rich.console import Console
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.text import write_text
+from vd4rl_pomdp.core.text import one_line, write_text
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note, write_table
 from vd4rl_pomdp.report.gates import verdicts
@@ -133,11 +133,11 @@ def print_comparison(comparison: SideBySide) -> None:
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side['others']} unfinished or diverged" if side["others"] else ""
         line = f"{name}: {side['path']}, {side['finished']} finished runs{others}"
-        console.print(line, markup=False, highlight=False)
+        console.print(one_line(line), markup=False, highlight=False)
     shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
     method = shown["method"] + "\n  " + shown.pop("settings, A → B")
     for place, part in shown.assign(method=method).groupby("setting", sort=False):
-        console.print(f"memory: {comparison.rows[part.index[0]]['memory']}", markup=False, highlight=False)
+        console.print(one_line(f"memory: {comparison.rows[part.index[0]]['memory']}"), markup=False, highlight=False)
         console.print(terminal(str(place), part.drop(columns="setting").replace(r" \[", "\n[", regex=True)))
     if any(row["shared"] for row in comparison.rows):
         console.print(NOT_INDEPENDENT, markup=False, highlight=False)

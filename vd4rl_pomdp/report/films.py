@@ -26,7 +26,9 @@ def read_film(path: Path) -> Film:
     with damaged(path, "cannot be read", "remove it, and the report goes without"):
         with np.load(io.BytesIO(read_bytes(path))) as file:
             film = dict(file)
-        if [film[name].ndim for name in FILM] != list(FILM.values()):
+        clean, corrupted, returns = shapes = [film[name].shape for name in FILM]
+        fit = list(map(len, shapes)) == list(FILM.values()) and len({shape[0] for shape in shapes}) == 1
+        if not fit or not returns[0] or clean[1:] != (3, *corrupted[2:]) or corrupted[1] % 3:
             raise ValueError("its arrays have other shapes")
         return film
 

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.options import settings_of
-from vd4rl_pomdp.core.text import write_text
+from vd4rl_pomdp.core.text import one_line, write_text
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, load, tables
 from vd4rl_pomdp.report.figures import Plot, draw_plots, seeds_note
@@ -414,9 +414,9 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     tallies = {claim: tally(rows) for claim, rows in groups(report.claims, claim_of).items()}
     lines += [f"{claim}: {text}" for claim, text in tallies.items() if text]
     for line in (*lines, f"{tables.SCORE}; mean over seeds [95% t interval]"):
-        console.print(line, markup=False, highlight=False)
+        console.print(one_line(line), markup=False, highlight=False)
     shown = texts(report.summary, SHOWN[MARK])
     for place, part in shown.groupby("setting", sort=False):
         missing = ["no result"] if part["no result"].any() else []
-        console.print(f"memory: {report.summary.loc[part.index[0], 'memory']}", markup=False, highlight=False)
+        console.print(one_line(f"memory: {report.summary.loc[part.index[0], 'memory']}"), markup=False, highlight=False)
         console.print(terminal(str(place), part[["method", "last evaluation", "seeds", "episodes", *missing]]))

@@ -83,6 +83,7 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
     fresh = path.with_name(f".{path.name}{own}.tmp")
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        fresh.unlink(missing_ok=True)  # a link of that name would be followed
         try:
             yield fresh
             # Flush the content before renaming, or a power cut could leave the name with an empty file.

@@ -51,7 +51,7 @@ CERTIFICATES = "certificates.json"
 NOT_CERTIFIED = "not certified"
 MEASURED = ("critic", "reference", "probe", "results")
 """FILES that hold a run's measures besides its rows."""
-_HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
+_HOLDS = {"data", "corruption", "name", "verdict", "why", "made", "measured", "budget"}
 DAMAGED = "its files are damaged", "use another copy, or leave it out"
 """Message for a run whose files do not hold what a run writes."""
 _ROUNDING = 1e-4  # tolerance of a score; scores and returns are stored with four decimals
@@ -215,6 +215,7 @@ def read_run(folder: Path | str) -> Result:
         if missing := [name for name in LABELS if name not in known]:
             raise UserError(f"{folder / FILES['labels']}: has no {missing[0]!r}; {remedy(folder)}")
         files["labels"] = files.get("labels", {}) | {name: known[name] for name in LABELS}
+        _check(run)  # also labels that config.json gives a run which has not begun
         return replace(run, id=_id(run))
 
 
@@ -233,6 +234,18 @@ def _check(run: Result) -> None:
         raise TypeError("a part of it is not a JSON object")
     if "seed" not in config or not isinstance(stage, str):
         raise TypeError(f"its record holds no settings, or its stage is {stage!r}")
+    texts = [part.get(name, {}) for part in (run.record, run.origin) for name in ("inputs", "plugins", "sources")]
+    typed: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        (run.record, {"inputs": dict, "collection": dict | None, "command": str, "plugins": dict, "sources": dict}),
+        (config, {"data": str | None}),
+        (run.encoder, {"corruption": dict | None, "data": str, "settings": dict | None}),
+        (run.files.get("labels", {}), dict.fromkeys(LABELS, str) | {"seed": int}),
+        *((part, dict.fromkeys(part, str)) for part in texts),
+    ]
+    for part, kinds in typed:
+        for name, kind in kinds.items():
+            if name in part and not fits(part[name], kind):
+                raise TypeError(f"its {name} is {part[name]!r}")
     numbers = [value for name in ("probe", "reference") for value in run.files.get(name, {}).values()]
     if any(isinstance(value, float) and not math.isfinite(value) for value in numbers):
         raise TypeError("its probe or reference is not finite")
@@ -353,7 +366,8 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
         longer = {run.id: replace(there[run.id], rows=run.rows) for run in same if not there[run.id].extends(run)}
         if fresh or longer:
             write_results(out, (there | fresh | longer).values())
-        keep_certificates(out, certificates_of(found, map(Path, paths)))
+        known, certified = certificates_of(found, map(Path, paths)), _certificates(out / CERTIFICATES)
+        keep_certificates(out, {name: one for name, one in known.items() if name not in certified})
     counts = {
         f"run{'s' * (len(fresh) != 1)} added": len(fresh) or "0",
         "there already": len(same) - len(longer),
@@ -362,6 +376,9 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
             len(again) - len(same)
         ),
         "unfinished and left out": len(found) - len(ended),
+        f"certificates unlike those there, which stay (remove those from {CERTIFICATES} to replace them)": sum(
+            certified.get(name, one) != one for name, one in known.items()
+        ),
     }
     return ", ".join(f"{number} {what}" for what, number in counts.items() if number)
 
@@ -377,16 +394,26 @@ def _rank(certificate: Row) -> tuple[int, int, str]:
     return budget.get("updates", 0), budget.get("steps", 0), str(certificate["made"])
 
 
-def read_certificates(places: Iterable[Path]) -> dict[str, Row]:
-    """All certificates at or below some folders, by id; of duplicates that of the largest budget, then the newest.
+def _certificates(file: Path) -> dict[str, Row]:
+    """Certificates of a file by id, none if it is missing; UserError if it is damaged."""
+    found = read_json(file) if file.is_file() else {}
+    for one in found.values():
+        whole = isinstance(one, dict) and one.keys() >= _HOLDS and fits(one["measured"], dict)
+        if not whole or not fits(one["budget"], dict) or not all(fits(size, int) for size in one["budget"].values()):
+            raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
+    return found
+
+
+def read_certificates(places: Iterable[Path], sets: Iterable[Path] = ()) -> dict[str, Row]:
+    """All certificates at or below some folders, and in dataset folders, by id; of duplicates that of the largest
+    budget, then the newest.
 
     UserError if a file is damaged.
     """
     found: dict[str, Row] = {}
-    for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
-        for name, one in read_json(file).items():
-            if not (isinstance(one, dict) and one.keys() >= _HOLDS):
-                raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
+    files = [file for place in places for file in files_below(place, CERTIFICATES)]
+    for file in dict.fromkeys([*files, *(one / CERTIFICATES for one in sets)]):
+        for name, one in _certificates(file).items():
             found[name] = max(found.get(name, one), one, key=_rank)
     return found
 
@@ -394,7 +421,7 @@ def read_certificates(places: Iterable[Path]) -> dict[str, Row]:
 def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
     """Add certificates to a folder's file, replacing those with the same id and no larger budget."""
     file = folder / CERTIFICATES
-    there = read_json(file) if file.exists() else {}
+    there = _certificates(file)
     merged = there | {name: max(there.get(name, one), one, key=_rank) for name, one in certificates.items()}
     if merged != there:
         write_json(file, merged)
@@ -408,7 +435,7 @@ def certificate_in_words(certificate: Row) -> str:
 def certificates_of(runs: Sequence[Result], places: Iterable[Path]) -> dict[str, Row]:
     """Certificates that apply to some runs, by id: found as by `read_certificates`, and in runs' dataset folders."""
     sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
-    known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())])
+    known = read_certificates(places, sorted(sets))
     return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
 
 
@@ -493,12 +520,14 @@ def _astray(run: Result) -> Iterator[str]:
         end = last if run.finished else (run.diverged or {"step": run.step})["step"] - 1
         judged = [(step, under) for step, under in played if run.finished or step <= end]
         wanted |= {(step, under): 0 for step, under in judged if step != last or under == own}
-        wanted |= {(step, own): count for step in {*range(every, end + 1, every), *[last] * run.finished}}
+        due = range(every, end + 1, every)
+        some = {*due[: len(played) + 1], *(step for step, _ in played if step in due)}  # the record may ask for any
+        wanted |= {(step, own): count for step in {*some, *[last] * run.finished}}
         if run.finished and config.get("eval_clean") and own != "none" and count:
             wanted[last, "none"] = config.get("eval_clean_episodes") or count
     for (step, under), count in sorted(wanted.items()):
         numbers = played.get((step, under), [])
-        if numbers != list(range(count)):
+        if len(numbers) != count or numbers != list(range(count)):
             yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
     task, reference, shipped = TASKS.get(run.labels["task"]), run.files.get("reference", {}), _shipped(run)
     longest = min(config.get("eval_length", math.inf), task.decisions if task else math.inf)

@@ -111,6 +111,9 @@ class DataSet:
 def set_of(cell: GridCell, root: Path) -> DataSet:
     """The dataset of a cell, below `root`."""
     section, wanted = cell.chain[0], collection_of(cell)
+    for name in _IN_NAMES[section]:
+        if wanted[name] in ("", ".", "..") or "/" in wanted[name]:
+            raise UserError(f"the grid's {section} has the {name} {wanted[name]!r}, which is no name of a folder")
     place = "/".join(wanted[name] for name in _IN_NAMES[section])
     name = place + _extras(cell, section)
     inner = root / name / _DOWNLOADED

@@ -1,11 +1,15 @@
 """Results folders hold the content of their runs' files and lose nothing."""
 
+import contextlib
 import errno
+import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tests.helpers_bad_input import rejection
 from tests.helpers_report import describe, grid, pretraining, without_figures, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -13,7 +17,7 @@ from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report.page import write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.results import Result, add_results, find_results, read_results, read_run
+from vd4rl_pomdp.runs.results import Result, add_results, certificates_of, find_results, read_results, read_run
 from vd4rl_pomdp.runs.run import identity
 
 
@@ -308,6 +312,93 @@ BAD = {
         (lambda text: text[:-20], "a row is not whole"),
     ],
 }
+
+
+@pytest.mark.parametrize(
+    ("part", "odd"),
+    [
+        ("config", {"collection": [1]}),
+        ("config", {"command": [1]}),
+        ("config", {"plugins": [1]}),
+        ("config", {"plugins": {"method acro": 1}}),
+        ("config", {"inputs": []}),
+        ("config", {"inputs": {"data": [1]}}),
+        ("config", {"config": {"seed": 0, "data": 5}}),
+        ("labels", {"method": 5}),
+        ("labels", {"quality": None}),
+        ("labels", {"seed": "x"}),
+        ("encoder", {"pretrain": {"corruption": [1]}}),
+    ],
+)
+def test_parts_of_other_types_are_rejected(tmp_path, part, odd):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
+    file = tmp_path / "out" / "runs.jsonl"
+    line = json.loads(file.read_text())
+    file.write_text(json.dumps(line | {part: line[part] | odd}) + "\n")
+    for words in (
+        ["report", "out", "--out", "new"],
+        ["results", "verify", "out"],
+        ["results", "add", "out", "--out", "b"],
+    ):
+        with contextlib.chdir(tmp_path):
+            assert "out/runs.jsonl: line 1: its files are damaged" in rejection(words)
+
+
+CERTIFICATE = {
+    **{"data": "f00", "corruption": {}, "name": "patch", "verdict": "needs a memory", "why": "R2", "made": "now"},
+    **{"measured": {}, "budget": {"steps": 10, "updates": 0}},
+}
+
+
+def certified(folder: Path, place: Path, **changes: Any) -> None:
+    """Write a certificate of the runs of a folder to a place."""
+    (run,) = find_results([folder])
+    place.mkdir(exist_ok=True)
+    write_json(place / "certificates.json", {run.certificate: CERTIFICATE | changes})
+
+
+def test_added_certificates_do_not_replace_those_there(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    add_results([run], tmp_path / "mine")
+    shutil.copytree(tmp_path / "mine", tmp_path / "theirs")
+    certified(run, tmp_path / "mine")
+    before = (tmp_path / "mine" / "certificates.json").read_bytes()
+    assert add_results([tmp_path / "mine"], tmp_path / "mine") == "0 runs added, 1 there already"
+    certified(run, tmp_path / "theirs", verdict="needs no memory", budget={"steps": 10**9, "updates": 10**9})
+    assert add_results([tmp_path / "theirs"], tmp_path / "mine").endswith(
+        "1 certificates unlike those there, which stay (remove those from certificates.json to replace them)"
+    )
+    assert (tmp_path / "mine" / "certificates.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("odd", [{"budget": [1]}, {"budget": {"steps": "x"}}, {"measured": None}])
+def test_certificates_of_other_types_are_rejected(tmp_path, odd):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
+    certified(tmp_path / "out", tmp_path / "out", **odd)
+    with pytest.raises(UserError, match=r"certificates\.json: is damaged; remove it, or write it again"):
+        write_report([tmp_path / "out"], tmp_path / "report")
+
+
+def test_certificates_of_a_runs_dataset_are_not_searched_below_it(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    record = read_json(run / "config.json")
+    write_json(run / "config.json", record | {"config": record["config"] | {"data": str(tmp_path / "set")}})
+    for place, found in (("set", True), ("set/below", False)):
+        shutil.rmtree(tmp_path / "set", ignore_errors=True)
+        (tmp_path / "set").mkdir()
+        certified(run, tmp_path / place)
+        assert bool(certificates_of([read_run(run)], [])) == found
+
+
+def test_links_at_temporary_names_are_not_followed(tmp_path):
+    whole_run(tmp_path / "runs/0")
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "out").mkdir()
+    for name in ("runs.jsonl", "episodes.csv"):
+        (tmp_path / "out" / f".{name}.tmp").symlink_to(tmp_path / "mine")
+    add_results([tmp_path / "runs"], tmp_path / "out")
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert len(read_results(tmp_path / "out")) == 1
 
 
 @pytest.mark.parametrize(("name", "change", "words"), [(name, *case) for name, cases in BAD.items() for case in cases])

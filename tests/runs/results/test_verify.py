@@ -208,6 +208,14 @@ def test_numbers_that_are_not_finite_are_rejected(results, name, key):
         changed(results, lambda line: line[name].update({key: float("nan")}))
 
 
+def test_records_of_endless_evaluations_are_contradicted_at_once(results):
+    ends = {"updates": 10**12, "eval_every": 1, "eval_episodes": 10**12}
+    found = changed(
+        results, lambda line: (line["config"]["config"].update(ends), line["timing"].update(updates=10**12))
+    )
+    assert any("at step 1 under patch it has the episodes [], its record 1000000000000" in one for one in found)
+
+
 CERTIFICATES = [
     (lambda text: "[]", "is not a JSON object"),
     (lambda text: '{"f00": {"data": 1}}', "f00: is damaged"),

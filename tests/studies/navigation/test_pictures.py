@@ -130,6 +130,7 @@ def test_only_images_of_the_pool_are_read(tmp_path, monkeypatch):
         ("data_batch_1", python_batch(b"\x00" * 100), "is not a CIFAR-10 file"),
         ("data_batch_1", b"\xfe\xfe\xfe", "is not a CIFAR-10 file"),
         ("a.png", b"not a picture", "cannot be read as an image"),
+        ("a.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n%%EOF\n", "cannot identify image"),
         ("a.png", torn_png(), "cannot be read as an image"),
         ("a.png", deep_png(), "more than 8 bits per channel .*: convert it to 8 bits"),
     ],

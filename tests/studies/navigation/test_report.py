@@ -300,6 +300,28 @@ def test_duplicate_runs_and_mixed_presets_are_rejected(tmp_path):
         loaded(tmp_path / "one", tmp_path / "other")
 
 
+def test_trajectories_linked_to_other_files_are_not_copied(runs, tmp_path):
+    write_report([runs], tmp_path / "kept")
+    (tmp_path / "linked").symlink_to("kept")
+    write_report([tmp_path / "linked"], tmp_path / "again")  # the folder itself may be a link
+    (tmp_path / "private").write_text("mine")
+    file = tmp_path / "kept" / "trajectories" / TRAJECTORY
+    file.unlink()
+    file.symlink_to(tmp_path / "private")
+    with pytest.raises(UserError, match=rf"{TRAJECTORY}: links to a file outside"):
+        write_report([tmp_path / "linked"], tmp_path / "new")
+
+
+def test_seeds_that_are_no_numbers_are_rejected(tmp_path):
+    write_report([write_run(tmp_path / "runs", Condition("three_curtains", "mik"), 0, 10.0)], tmp_path / "kept")
+    file = tmp_path / "kept" / "runs.jsonl"
+    line = json.loads(file.read_text())
+    line["config"]["config"]["seed"] = "/../../0"  # it is part of a file's name
+    file.write_text(json.dumps(line) + "\n")
+    with pytest.raises(UserError, match="its results are damaged"):
+        write_report([tmp_path / "kept"], tmp_path / "out")
+
+
 def test_report_includes_sample_observations_on_request(runs, tmp_path):
     rng = np.random.default_rng(0)
     samples = {name: rng.integers(0, 256, (2, 3, 9, 9), np.uint8) for name in ("a maze", "with noise, dark")}

@@ -24,7 +24,7 @@ import pandas as pd
 from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import fits, rgb_of
+from vd4rl_pomdp.core.reading import PICTURES, fits, rgb_of
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import FRAMES_KEY
 from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, chosen, library, rows_of
@@ -59,7 +59,10 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
 
     def files(kind: str, template: str) -> list[Path]:
         numbers = zip(episodes[f"{kind}/chunk_index"], episodes[f"{kind}/file_index"], strict=True)
-        return [folder / template.format(chunk_index=c, file_index=f, video_key=key) for c, f in numbers]
+        names = [Path(template.format(chunk_index=c, file_index=f, video_key=key)) for c, f in numbers]
+        if outside := [name for name in names if name.is_absolute() or ".." in name.parts]:
+            raise UserError(f"its meta/info.json names the file {outside[0]}, outside its folder; download it again")
+        return [folder / name for name in names]
 
     data, filmed = files("data", info["data_path"]), features[key]["dtype"] == "video"
     films = files(f"videos/{key}", info["video_path"]) if filmed else []
@@ -79,11 +82,13 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
         for number, stored in _stored(data, lengths, columns, first):
             if filmed:
                 times = episodes[f"videos/{key}/from_timestamp"][number] + stored["timestamp"].astype(float)
-                frames = _filmed(films[number], times, info["fps"])
+                frames = _filmed(films[number], times, info["fps"], shape)
             elif None in stored[key]:
                 raise UserError("its images are stored outside data/, which is not supported")
             else:
-                opened = (Image.open(io.BytesIO(one)) for one in stored[key])
+                opened = [Image.open(io.BytesIO(one), formats=PICTURES) for one in stored[key]]
+                for one in opened:  # before they are decoded: a few kilobytes may hold gigabytes
+                    _check_size((one.height, one.width), shape)
                 frames = _stacked([np.asarray(rgb_of(one)) for one in opened])
             yield _rows(stored, frames, own)
 
@@ -182,17 +187,24 @@ def _stacked(pictures: list[np.ndarray]) -> np.ndarray:
     return np.stack([one.transpose(2, 0, 1) for one in pictures], out=out)
 
 
-def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
-    """Decode a video's frames (T, 3, H, W) uint8 at increasing times, in seconds of the file."""
+def _check_size(size: tuple[int, int], declared: tuple[int, int]) -> None:
+    if size != declared:
+        found, wanted = (f"{height}x{width}" for height, width in (size, declared))
+        raise UserError(f"has images of {found} pixels, its dataset declares {wanted}")
+
+
+def _filmed(path: Path, times: np.ndarray, fps: float, size: tuple[int, int]) -> np.ndarray:
+    """Decode a video's frames (T, 3, H, W) uint8 at increasing times, in seconds of the file; `size` is (H, W)."""
     av = library("av", _EXTRA)
     # Shared by all frames: `frame.to_ndarray(format=...)` creates one per frame, which is four times slower.
     converter = av.video.reformatter.VideoReformatter()
     pictures: list[np.ndarray] = []
     try:
-        with av.open(str(path)) as file:
+        with av.open(str(path), format="mp4") as file:  # other formats, such as playlists, read other files
             stream = file.streams.video[0]
             file.seek(max(0, int((times[0] - 0.5 / fps) / stream.time_base)), stream=stream)
             for frame in file.decode(stream):
+                _check_size((frame.height, frame.width), size)
                 if frame.time > times[len(pictures)] + 0.5 / fps:
                     break
                 if frame.time > times[len(pictures)] - 0.5 / fps:
@@ -234,7 +246,7 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
             film = folder / _VIDEO.format(video_key=_PICTURE, **_numbered("", number))
             _encode(film, pictures)
             if number % 10 == 0:
-                decoded = _filmed(film, columns["timestamp"].astype(float), _FPS)
+                decoded = _filmed(film, columns["timestamp"].astype(float), _FPS, (size, size))
                 change = np.abs(decoded.astype(np.int16) - rows[FRAMES_KEY])
                 changes.append((change.mean(), change.max()))
             where = _numbered("", number) | {"from_timestamp": 0.0, "to_timestamp": len(pictures) / _FPS}

@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import h5py
 import numpy as np
 
 from vd4rl_pomdp.core.errors import DiskFullError, UserError
+from vd4rl_pomdp.core.reading import regular
 from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.format import FRAMES_KEY
+from vd4rl_pomdp.data.format import FRAMES_KEY, refuse_elsewhere
 from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chosen, library, one_hot, rows_of
 from vd4rl_pomdp.data.shards import EpisodeArrays
 
@@ -37,6 +39,9 @@ def read(source: str, picture: str | None) -> SourceSet:
         raise UserError(
             f"is neither a Minari folder nor an installed Minari dataset: run `minari download {source}`?"
         ) from error
+    for file in Path(dataset.storage.data_path).glob("*.hdf5"):
+        with h5py.File(regular(file)) as opened:
+            refuse_elsewhere(file, opened)
     actions = dataset.action_space
     discrete = isinstance(actions, gymnasium.spaces.Discrete)
     if not discrete and not isinstance(actions, gymnasium.spaces.Box):

@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.reading import damaged, read_bytes, rgb_of
+from vd4rl_pomdp.core.reading import PICTURES, damaged, read_bytes, rgb_of
 from vd4rl_pomdp.core.streams import stream_seed
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
@@ -145,7 +145,7 @@ def _read_image(path: Path) -> np.ndarray:
     """(H, W, 3) uint8 of one PNG or JPEG file."""
     content = read_bytes(path)
     try:
-        return np.asarray(rgb_of(Image.open(io.BytesIO(content))))
+        return np.asarray(rgb_of(Image.open(io.BytesIO(content), formats=PICTURES)))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # raised by Pillow
         raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
 

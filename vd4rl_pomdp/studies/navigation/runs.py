@@ -21,7 +21,7 @@ import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import settings_of
-from vd4rl_pomdp.core.reading import damaged, read_bytes
+from vd4rl_pomdp.core.reading import damaged, inside, read_bytes
 from vd4rl_pomdp.envs.mazes import MAZES, PAPER_MAZES
 from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.results import Result, find_results, refuse_loss, write_results
@@ -171,7 +171,7 @@ class NavigationRun:
         """A held-out trajectory with estimated states; run folders have one, results folders may."""
         folder = self.result.path
         path = folder / TRAJECTORY_FILE if self.result.folder else folder / TRAJECTORIES / self.file_name
-        return path if path.is_file() else None
+        return inside(folder, path) if path.is_file() else None
 
 
 def read_trajectory(path: Path) -> pd.DataFrame:
@@ -237,7 +237,7 @@ def _read_run(result: Result) -> NavigationRun:
         settings |= {name: value for name, value in result.record.get("inputs", {}).items() if name == "exogenous"}
         left_out = {"method", "max_k", "literal_future", "preset", "steps" * (condition.method == UNTRAINED)}
         settings = {name: str(value) for name, value in settings.items() if name not in left_out}
-        run = NavigationRun(result, condition, config["preset"], config["seed"], settings, values)
+        run = NavigationRun(result, condition, config["preset"], int(config["seed"]), settings, values)
         _ = float(timing["seconds"]), result.record["command"]  # for the report
     for measure, value in values.items():
         if not math.isfinite(value):
