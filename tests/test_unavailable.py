@@ -68,7 +68,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     copyfile(ASSETS / "walker_walk_expert.safetensors", actor)
     copyfile(ASSETS / "walker_walk_replay.safetensors", ladder)
     with (run / FILM_FILE).open("wb") as file:
-        np.savez(file, **{name: np.zeros((1,) * axes) for name, axes in FILM.items()})
+        np.savez(file, **dict(zip(FILM, map(np.zeros, ((1, 3, 4, 4), (1, 9, 4, 4), 1)), strict=True)))
     (run / "episodes.csv").write_text(",".join(COLUMNS) + "\n")
     (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
     (run / RUNS).write_text("{}\n")

@@ -104,7 +104,7 @@ def test_training_in_bf16_warns_where_the_cpu_has_no_kernels(encoder, data, tmp_
         finetune(smoke_finetune(encoder, data, place / "tuned", updates=1, batch_size=4, eval_episodes=0, **both))
         hardware.warn_of_slow_bf16(torch.device("cuda"), **both)
         lines = [line for line in capsys.readouterr().err.splitlines() if "no bf16 kernels" in line]
-        return [line.partition("start again with ")[2] for line in lines]
+        return [line.partition("a new run with ")[2] for line in lines]
 
     assert warned(False, "bf16") == ["--precision fp32", "--precision fp32 --update-precision fp32"]
     assert warned(True, "bf16") == warned(False, "fp32") == []

@@ -169,6 +169,9 @@ def test_rows_outside_episodes_are_rejected(tmp_path, cache):
     (folder / "1_fake.hdf5").replace(folder / "0_fake.hdf5")
     with pytest.raises(UserError, match=r"0_fake\.hdf5: row 0 has step_type 1, but the first row .*missing"):
         open_store(folder, cache)
+    folder = write_fake_set(tmp_path / "groups", (4, 4), cuts=(2,), names=["0_a.hdf5", "0_b.hdf5"])
+    with pytest.raises(UserError, match=r"0_b\.hdf5: row 0 is the first of its shards, but begins no episode"):
+        open_store(folder, cache)
     assert visible(cache) == []
 
 

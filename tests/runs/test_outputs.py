@@ -159,7 +159,7 @@ def test_built_folder_appears_complete_or_not_at_all(tmp_path):
     build(tmp_path / "new")
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "a"]
     hidden = fill(tmp_path / "hidden", __DS_Store="of a file manager")
-    with pytest.raises(UserError, match="hidden: is not empty; choose another --out"):
+    with pytest.raises(UserError, match=r"hidden: is not empty \(holds .DS_Store\); choose another folder"):
         build(hidden)
 
 

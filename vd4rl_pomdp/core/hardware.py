@@ -76,7 +76,7 @@ def warn_of_slow_bf16(device: torch.device, **precisions: Precision) -> None:
     flags = " ".join(f"{flag_of(name)} fp32" for name, precision in precisions.items() if precision == "bf16")
     if flags and device.type == "cpu" and not bf16_kernels():
         print(
-            "warning: this CPU has no bf16 kernels, so bf16 is several times slower than fp32: start again with "
+            "warning: this CPU has no bf16 kernels, so bf16 is several times slower than fp32: consider a new run with "
             f"{flags}",
             file=sys.stderr,
         )

@@ -229,6 +229,9 @@ def _check_episodes(shards: Sequence[Path], counts: Sequence[int], step_type: np
     strays = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
     if len(strays):
         fail(int(strays[0]), "follows an episode's last row without beginning a new one")
+    for shard, row in zip(shards[1:], starts[1:-1], strict=True):
+        if _shard_number(shard)[1] == 0 and step_type[row] != StepType.FIRST:
+            fail(int(row), "is the first of its shards, but begins no episode")
 
 
 def check_lengths(place: Path | str, lengths: Sequence[int] | np.ndarray) -> None:

@@ -189,11 +189,12 @@ def refuse_elsewhere(path: Path, file: h5py.File) -> None:
     A data set from elsewhere must not make its reader read other files here.
     """
 
-    def elsewhere(name: bytes) -> str | None:
-        kind = file.id.links.get_info(name).type  # h5py's own functions open what a link names
+    names: list[bytes] = []
+    file.id.links.visit(names.append)  # h5py's own functions open what a link names; no callback may raise
+    for name in names:
+        kind = file.id.links.get_info(name).type
         stored = file[name] if kind == h5py.h5l.TYPE_HARD else None
         kept = isinstance(stored, h5py.Dataset) and (stored.external or stored.is_virtual)
-        return name.decode(errors="replace") if kept or kind == h5py.h5l.TYPE_EXTERNAL else None
-
-    if found := file.id.links.visit(elsewhere):
-        raise UserError(f"{path}: {found!r} is stored in another file, which is not supported; {_REPAIR}")
+        if kept or kind == h5py.h5l.TYPE_EXTERNAL:
+            found = name.decode(errors="replace")
+            raise UserError(f"{path}: {found!r} is stored in another file, which is not supported; {_REPAIR}")

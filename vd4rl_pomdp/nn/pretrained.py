@@ -75,8 +75,8 @@ class Pretrained(nn.Module):
         # not if its weights are given: an encoder that was trained on what the model sees stays usable
         if not weights and isinstance(patch, int) and size % patch:
             raise UserError(
-                f"--model {name}: ignores the last rows and columns of images of {size}x{size} pixels: choose a "
-                "--model-size that is a multiple of the model's patch size"
+                f"--model {name}: {size} pixels are no multiple of its patch size {patch}, so it may ignore the last "
+                "rows and columns: choose another --model-size"
             )
 
     def forward(self, image: Tensor) -> Tensor:

@@ -141,8 +141,8 @@ def built(out: Path) -> Iterator[Path]:
     refuse_no_folder(out)
     absolute = Path(os.path.realpath(out))  # a link stays one
     with disk_errors(out):
-        if absolute.is_dir() and os.listdir(absolute):
-            raise UserError(f"{out}: is not empty; choose another --out")
+        if absolute.is_dir() and (held := os.listdir(absolute)):
+            raise UserError(f"{out}: is not empty (holds {min(held)}); choose another folder")
     if os.path.ismount(absolute):  # could not be replaced at the end
         raise UserError(f"{out}: is a mount point; choose a folder in it")
     hidden = absolute.with_name(f".{absolute.name}.export")

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -435,7 +436,8 @@ def certificate_in_words(certificate: Row) -> str:
 def certificates_of(runs: Sequence[Result], places: Iterable[Path]) -> dict[str, Row]:
     """Certificates that apply to some runs, by id: found as by `read_certificates`, and in runs' dataset folders."""
     sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
-    known = read_certificates(places, sorted(sets))
+    there = sorted(one for one in sets if os.access(one / CERTIFICATES, os.R_OK))  # others' datasets may be closed
+    known = read_certificates(places, there)
     return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
 
 

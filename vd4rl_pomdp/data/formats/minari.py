@@ -39,7 +39,7 @@ def read(source: str, picture: str | None) -> SourceSet:
         raise UserError(
             f"is neither a Minari folder nor an installed Minari dataset: run `minari download {source}`?"
         ) from error
-    for file in Path(dataset.storage.data_path).glob("*.hdf5"):
+    for file in Path(dataset.storage.data_path).glob("[!.]*.hdf5"):
         with h5py.File(regular(file)) as opened:
             refuse_elsewhere(file, opened)
     actions = dataset.action_space
