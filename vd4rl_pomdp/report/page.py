@@ -418,5 +418,6 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     shown = texts(report.summary, SHOWN[MARK])
     for place, part in shown.groupby("setting", sort=False):
         missing = ["no result"] if part["no result"].any() else []
-        console.print(one_line(f"memory: {report.summary.loc[part.index[0], 'memory']}"), markup=False, highlight=False)
+        memory = f"{place}, memory: {report.summary.loc[part.index[0], 'memory']}"
+        console.print(one_line(memory), markup=False, highlight=False)
         console.print(terminal(str(place), part[["method", "last evaluation", "seeds", "episodes", *missing]]))
