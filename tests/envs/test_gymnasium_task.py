@@ -155,9 +155,17 @@ def test_environment_without_seed_is_rejected():
         make_env(GymnasiumTask(failing)).reset(0)
 
 
-@pytest.mark.parametrize(("metadata", "rate"), [({"render_fps": 20}, 10), ({"render_fps": None}, 15), ({}, 15)])
-def test_frame_rate_is_that_of_the_metadata(metadata, rate):
-    env = make_env(GymnasiumTask(type("Timed", (Counter,), {"metadata": metadata}), action_repeat=2))
+@pytest.mark.parametrize(
+    ("attributes", "rate"),
+    [
+        ({"metadata": {"render_fps": 20}}, 10),
+        ({"metadata": {"render_fps": None}}, 15),
+        ({"metadata": {}}, 15),
+        ({"metadata": {"render_fps": 25}, "control_timestep": lambda self: 0.025}, 20),  # as shimmy's
+    ],
+)
+def test_frame_rate_prefers_time_step_over_metadata(attributes, rate):
+    env = make_env(GymnasiumTask(type("Timed", (Counter,), attributes), action_repeat=2))
     assert env.rate == rate
 
 

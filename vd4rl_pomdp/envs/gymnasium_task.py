@@ -76,8 +76,10 @@ class GymnasiumEnv(PixelEnv):
 
     @property
     def rate(self) -> float:
-        """Decisions per second by the environment's `render_fps`, else by 30."""
-        return (self.env.metadata.get("render_fps") or 30) / self.task.action_repeat
+        """Decisions per second: by dm_control's time step, the environment's `render_fps`, or 30."""
+        step = getattr(self.env.unwrapped, "control_timestep", None)  # shimmy's render_fps is in milliseconds
+        rate = 1 / step() if callable(step) else self.env.metadata.get("render_fps") or 30
+        return rate / self.task.action_repeat
 
     def close(self) -> None:
         self.env.close()
