@@ -309,6 +309,8 @@ def lead_plots(leads: pd.DataFrame) -> list[Plot]:
             axes.errorbar(place, middle, reach, lw=1.3, capsize=3, label=plain(name, NAME_WIDTH), **look)
             for where in place[middle.isna()]:
                 axes.text(where, 0, "missing", color=look["color"], rotation=90, fontsize=7, ha="center", va="bottom")
+            for where, top, seeds in zip(place, middle + reach[1], mine["seeds"], strict=True):
+                axes.annotate(str(seeds), (where, top), (0, 4), textcoords="offset points", ha="center", fontsize=7)
         axes.axhline(0, color="black", lw=0.8)
         axes.set_xscale("log")
         ticks = dict(zip(seen, rows["steps"].map("{:,}".format) + "\nx " + rows["stacks"].astype(str), strict=True))
@@ -319,7 +321,7 @@ def lead_plots(leads: pd.DataFrame) -> list[Plot]:
 
     caption = (
         "Lead by pretraining budget under {}: difference of mean returns, each in % of the mean return of "
-        "its own data, with 95% t intervals over seeds and episodes if both sides have two seeds."
+        "its own data, with the number of seeds, and 95% t intervals over seeds and episodes if both sides have two."
     )
     return _plots(leads, "lead", caption, draw, 2)
 
