@@ -90,9 +90,9 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
     for row in judge_claims(list(runs), unranked(gates(list(runs)))):
         few = row["family"] == PRIMARY and min(row["left_seeds"], row["right_seeds"]) < LEAST_SEEDS
         if row["family"] not in ("", EXPLORATORY):
-            other = row["verdict"].removeprefix(UNJUDGED) if row["verdict"].startswith(UNJUDGED) else ""
-            reasons = ", ".join(filter(None, ("missing seeds", other)))
-            found.append(row | {"verdict": f"{UNJUDGED}{reasons}" if few else row["verdict"]})
+            verdict = row["verdict"]
+            other = f", {verdict.removeprefix(UNJUDGED)}" * verdict.startswith(UNJUDGED)
+            found.append(row | {"verdict": f"{UNJUDGED}missing seeds{other}" if few else verdict})
     place = itemgetter("claim", "task", "quality", "corruption")
     rows, same_claim = [], groups(found, place)
     for row in found:

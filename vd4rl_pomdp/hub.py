@@ -40,7 +40,7 @@ from vd4rl_pomdp.nn.encoder_folder import (
     read_record,
 )
 from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
-from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
+from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside, refuse_mount
 
 LISTING = "vd4rl_pomdp.json"
 ENCODER, AGENT, SET = "an encoder", "an agent", "a data set"
@@ -118,8 +118,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             raise UserError(
                 f"{folder}: is not empty and holds something other than {repository}; choose another folder"
             )
-        if os.path.ismount(folder):  # before the download, after which the folder could not be replaced
-            raise UserError(f"{folder}: is a mount point; choose a folder in it")
+        refuse_mount(folder)
         # Next to the folder, so that the final rename is atomic; its fixed name lets the next pull resume.
         api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*map(glob.escape, listing)])
     with disk_errors(folder):

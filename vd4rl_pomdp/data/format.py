@@ -188,7 +188,6 @@ def refuse_elsewhere(path: Path, file: h5py.File) -> None:
 
     A data set from elsewhere must not make its reader read other files here.
     """
-
     names: list[bytes] = []
     file.id.links.visit(names.append)  # h5py's own functions open what a link names; no callback may raise
     for name in names:

@@ -15,7 +15,7 @@ from vd4rl_pomdp.report.figures import seeds_note, write_table
 from vd4rl_pomdp.report.gates import verdicts
 from vd4rl_pomdp.report.load import CONDITION, SETTING, Run, label, load_runs, setting
 from vd4rl_pomdp.report.page import made_with
-from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
+from vd4rl_pomdp.report.render import Columns, block, print_setting, render, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import certificates_of
@@ -137,8 +137,8 @@ def print_comparison(comparison: SideBySide) -> None:
     shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
     method = shown["method"] + "\n  " + shown.pop("settings, A → B")
     for place, part in shown.assign(method=method).groupby("setting", sort=False):
-        console.print(one_line(f"memory: {comparison.rows[part.index[0]]['memory']}"), markup=False, highlight=False)
-        console.print(terminal(str(place), part.drop(columns="setting").replace(r" \[", "\n[", regex=True)))
+        table = part.drop(columns="setting").replace(r" \[", "\n[", regex=True)
+        print_setting(console, str(place), comparison.rows[part.index[0]]["memory"], table)
     if any(row["shared"] for row in comparison.rows):
         console.print(NOT_INDEPENDENT, markup=False, highlight=False)
 

@@ -26,7 +26,7 @@ from vd4rl_pomdp.report.figures import Plot, draw_plots, seeds_note
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gates import gates, judge_claims, leads, opposite, tally, unranked, verdicts
 from vd4rl_pomdp.report.load import ALL, COSTS, PROBES, SETTING, Choice, Run, label, setting, title
-from vd4rl_pomdp.report.render import Block, Columns, block, render, terminal, texts, write_latex
+from vd4rl_pomdp.report.render import Block, Columns, block, print_setting, render, texts, write_latex
 from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.runs.files import Row, groups
@@ -418,6 +418,5 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     shown = texts(report.summary, SHOWN[MARK])
     for place, part in shown.groupby("setting", sort=False):
         missing = ["no result"] if part["no result"].any() else []
-        memory = f"{place}, memory: {report.summary.loc[part.index[0], 'memory']}"
-        console.print(one_line(memory), markup=False, highlight=False)
-        console.print(terminal(str(place), part[["method", "last evaluation", "seeds", "episodes", *missing]]))
+        table = part[["method", "last evaluation", "seeds", "episodes", *missing]]
+        print_setting(console, str(place), report.summary.loc[part.index[0], "memory"], table)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 import pandas as pd
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -73,12 +74,13 @@ def write_latex(path: Path, table: pd.DataFrame, words: int, note: str = "") -> 
     write_bytes(path, f"% \\usepackage{{booktabs, longtable}}\n{text}".encode(errors="backslashreplace"))
 
 
-def terminal(title: str, table: pd.DataFrame) -> Table:
-    """A table of text for the terminal. The first column and the gaps wrap; numbers do not."""
-    shown = Table(title=Text(title), title_justify="left")
+def print_setting(console: Console, setting: str, memory: str, table: pd.DataFrame) -> None:
+    """Print a setting's verdict on memory and its table of text, whose first column and gaps wrap; numbers do not."""
+    console.print(one_line(f"{setting}, memory: {memory}"), markup=False, highlight=False)
+    shown = Table(title=Text(setting), title_justify="left")
     for name in table.columns:
         words = name in (table.columns[0], "no result")
         shown.add_column(name, overflow="fold", justify="left" if words else "right", no_wrap=not words)
     for row in table.itertuples(index=False):
         shown.add_row(*map(Text, row))
-    return shown
+    console.print(shown)

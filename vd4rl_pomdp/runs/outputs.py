@@ -53,6 +53,12 @@ def refuse_foreign(out: Path, what: str, *marks: str) -> None:
         raise UserError(f"{out}: is not empty and holds no {what}; choose another --out")
 
 
+def refuse_mount(folder: Path) -> None:
+    """Raise UserError, before the work, for an empty folder that could not be replaced at its end."""
+    if os.path.ismount(os.path.realpath(folder)):  # of a link, its target
+        raise UserError(f"{folder}: is a mount point; choose a folder in it")
+
+
 def kept_in(folder: Path) -> str | None:
     """What a folder holds, by its files: "a run", "a policy", "an encoder", "an agent", "a data set", or None."""
     names = set(_names(folder))
@@ -143,8 +149,7 @@ def built(out: Path) -> Iterator[Path]:
     with disk_errors(out):
         if absolute.is_dir() and (held := os.listdir(absolute)):
             raise UserError(f"{out}: is not empty (holds {min(held)}); choose another folder")
-    if os.path.ismount(absolute):  # could not be replaced at the end
-        raise UserError(f"{out}: is a mount point; choose a folder in it")
+    refuse_mount(out)
     hidden = absolute.with_name(f".{absolute.name}.export")
     made = hidden / "new"
     with removing_if_empty(hidden, True), owned(hidden):
