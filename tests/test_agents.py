@@ -121,7 +121,11 @@ def test_exported_agent_reproduces_episodes_of_its_card(data, encoder, tmp_path,
             assert all(torch.equal(half[key], value.half()) for key, value in whole.items())
             assert (out / name).stat().st_size < 0.55 * (run / name).stat().st_size
     assert f"{out}: is not empty (holds" in rejection(["agents", "export", str(run), "--out", str(out)])
-    for film, message in ((tmp_path, "is a folder"), (run / "film.webp", "lies inside")):
+    for film, message in (
+        (tmp_path, "ends in .webp"),
+        (tmp_path / "film.gif", "ends in .webp"),
+        (run / "film.webp", "lies inside"),
+    ):
         assert message in rejection(["agents", "play", str(out), "--film", str(film)])
     for name in FILES:
         whole = (out / name).read_bytes()

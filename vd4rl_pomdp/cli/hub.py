@@ -9,7 +9,7 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command
 from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
-from vd4rl_pomdp.core.text import one_line
+from vd4rl_pomdp.core.text import counted, one_line
 from vd4rl_pomdp.report.stats import mean_interval, with_interval
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -69,7 +69,7 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
     card = export_agent(run, out, episodes, workers)
     for under in dict.fromkeys(row["evaluated_under"] for row in card["episodes"]):
         returns = [row["return"] for row in card["episodes"] if row["evaluated_under"] == under]
-        print(f"{len(returns)} episodes under {under}: mean return {sum(returns) / len(returns):.4f}")
+        print(f"{counted(len(returns), 'episode')} under {under}: mean return {sum(returns) / len(returns):.4f}")
     print(f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")')
 
 
@@ -91,11 +91,11 @@ def play(
     if film:
         refuse_inside(film)
         refuse_no_folder(film.parent)
-        if film.is_dir():
-            raise UserError(f"{film}: is a folder; name a file for the film")
+        if film.suffix != ".webp" or film.is_dir():
+            raise UserError(f"{film}: films are animated WebP; name a file that ends in .webp")
     cards, played = play_agents(agents, episodes, workers)
-    under = cards[0]["corruption"]["corruption"]
-    print(f"{episodes} episodes of {cards[0]['task']} under {under}: mean return [95% t interval over episodes]")
+    under, count = cards[0]["corruption"]["corruption"], counted(episodes, "episode")
+    print(f"{count} of {cards[0]['task']} under {under}: mean return [95% t interval over episodes]")
     returns = [np.array([episode.total for episode in one])[:, None] for one in played]
     about = [f"{card['method']}, seed {card['seed']}" for card in cards]
     names = [name if about.count(name) == 1 else given for name, given in zip(about, agents, strict=True)]

@@ -16,6 +16,11 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.splitlines()).replace("\t", " "))
 
 
+def counted(number: int, noun: str) -> str:
+    """Such as "1 episode" and "2 episodes"."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def markdown(text: str) -> str:
     """Escape text for a Markdown paragraph or table cell."""
     marked = _MARKS.sub(r"\\\1", one_line(text))

@@ -26,6 +26,7 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import distinct_texts
 from vd4rl_pomdp.core.options import settings_of
+from vd4rl_pomdp.core.text import counted
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import load, stats
 from vd4rl_pomdp.report.load import REFERENCES, SETTING, STATE, Run, label
@@ -418,7 +419,7 @@ def tally(rows: list[Row]) -> str:
         return ""
     counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
     noun = "setting" if len({_place(row) for row in rows}) == len(rows) else "comparison"
-    words = [f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} {noun}{'s' * (len(rows) != 1)}"]
+    words = [f"{HOLDS} in {counts.pop(HOLDS, 0)} of {counted(len(rows), noun)}"]
     reasons = {name.removeprefix(UNJUDGED): counts.pop(name) for name in [*counts] if name.startswith(UNJUDGED)}
     words += [f"{verdict} in {count}" for verdict, count in counts.items()]
     if reasons:

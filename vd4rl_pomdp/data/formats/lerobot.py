@@ -14,6 +14,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -238,7 +239,8 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
             lost["actions, rewards and discounts in first rows, which no step led to, are not stored"] = None
         pictures = np.ascontiguousarray(rows[FRAMES_KEY].transpose(0, 2, 3, 1))
         columns, begin, end = _columns(rows, number, end), end, end + len(pictures)
-        held.append(_table(columns, [] if video else [_png(one) for one in pictures]))
+        with ThreadPoolExecutor() as pool:  # encoding releases the interpreter's lock
+            held.append(_table(columns, [] if video else list(pool.map(_png, pictures))))
         place = {"episode_index": number, "tasks": [source.task or _NO_TASK], "length": end - begin}
         place |= {"dataset_from_index": begin, "dataset_to_index": end}
         place |= _numbered("data/", files) | _numbered("meta/episodes/", 0)
