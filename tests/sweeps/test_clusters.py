@@ -88,6 +88,8 @@ def test_slurm_errors_timeouts_and_stop(fakes, tmp_path, monkeypatch, capsys):
     text = "".join(script.read_text() for script in (tmp_path / "slurm").glob("*.sh"))
     assert f"--job-name={cluster._name}\n" in text
     assert "--array=0-2%3\n" in text
+    with pytest.raises(UnavailableError, match=r"squeue says \(no host no server\)"):
+        fakes(squeue=r"printf 'no host\nno server\n' >&2; exit 1").live()
     fakes(squeue=":").stop()
     lines = [line.split()[-1] for line in (tmp_path / "called").read_text().splitlines() if line.startswith("scancel")]
     assert lines == ["--state=PENDING", "--signal=USR2", "--quiet"]

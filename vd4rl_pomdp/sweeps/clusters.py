@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, first_line
+from vd4rl_pomdp.core.text import one_line
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, in_stacks, note, say
@@ -172,7 +173,7 @@ class SlurmCluster:
         except subprocess.TimeoutExpired as error:
             raise UnavailableError(f"Slurm does not answer: {command} has not ended after {ANSWER_S:g} s") from error
         if answer.returncode and command == "squeue":  # scancel also fails when there is nothing to cancel
-            raise UnavailableError(f"Slurm does not answer: see what squeue says ({answer.stderr.strip()})")
+            raise UnavailableError(f"Slurm does not answer: see what squeue says ({one_line(answer.stderr.strip())})")
         return answer.stdout
 
 
