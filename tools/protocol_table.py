@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from operator import itemgetter
 
 import numpy as np
@@ -19,22 +20,36 @@ from vd4rl_pomdp.report.gates import (
     opposite,
     unranked,
 )
-from vd4rl_pomdp.report.load import PROBES, Run, label
+from vd4rl_pomdp.report.load import PROBES, Run
 from vd4rl_pomdp.report.stats import number, with_interval
 from vd4rl_pomdp.runs.files import groups
+
+BUDGET = r", updates (\d+)"
+"""A budget in a label, which names it because runs of several are loaded; the tables tell it with the setting."""
+
+
+def place_of(run: Run) -> tuple[str, str, str, int]:
+    """Task, quality, corruption and updates."""
+    task, quality, corruption = run.of(("task", "quality", "corruption"))
+    return task, quality, corruption, int(run.settings["updates"])
+
+
+def setting(place: Iterable[str], updates: int) -> str:
+    """Such as "walker_walk, medium_expert, patch, 60,000 updates"."""
+    return f"{', '.join(place)}, {updates:,} updates"
 
 
 def method_lines(runs: Sequence[Run]) -> Iterator[str]:
     """One row per setting and method, by decreasing return: returns as trained and clean, probes and critics."""
     rows = []
-    for place, here in groups(runs, lambda run: run.of(("task", "quality", "corruption"))).items():
-        by_method = groups(here, lambda run: label(run.named))
+    for (*place, updates), here in groups(runs, place_of).items():
+        by_method = groups(here, called)
         for name, mine in sorted(by_method.items(), key=lambda item: -episodes_of(item[1]).mean()):
             clean = number(None) if place[2] == CLEAN else _of_seeds(episodes_of(mine, clean=True))
             probes = ", ".join(f"{np.mean([run.measures[probe] for run in mine]):.0f}" for probe in PROBES)
             moved = 100 * np.max(np.abs(np.array([run.measures["critic_moved"] for run in mine], dtype=float)))
             cells = _of_seeds(episodes_of(mine)), clean, probes, f"{moved:.2f}%"
-            rows.append((", ".join(place), f"`{name}`", len(mine), *cells))
+            rows.append((setting(place, updates), f"`{name}`", len(mine), *cells))
     head = ("setting", "method", "n", "return", "evaluated clean", "probe: pose, velocity", "critic moved at most")
     return table_lines(head, rows, (0, 1))
 
@@ -52,15 +67,14 @@ PAIRS = (("mik", "acro"), (GRU, "acro"), ("mik+a", "mik"), ("mik+a", "acro"), ("
 
 
 def called(run: Run) -> str:
-    """A run's method or GRU, whatever its budget: labels name a budget where runs of several are loaded."""
+    """A run's method or GRU, whatever its budget."""
     return GRU if run.method == "acro" and run.settings.get("history") == "gru" else run.method
 
 
 def paired_lines(runs: Sequence[Run]) -> Iterator[str]:
     """Differences paired by training seed, since methods share its dataset; where three seeds were evaluated clean."""
     rows = []
-    by_place = groups(runs, lambda run: (*run.of(("task", "quality", "corruption")), run.settings["updates"]))
-    for (*place, updates), here in by_place.items():
+    for (*place, updates), here in groups(runs, place_of).items():
         by_method = groups((run for run in here if run.last_clean), called)
         by_seed = {name: {run.labels["seed"]: run for run in mine} for name, mine in by_method.items()}
         for names in PAIRS:
@@ -73,8 +87,7 @@ def paired_lines(runs: Sequence[Run]) -> Iterator[str]:
                 )
                 change = trained.mean(1, keepdims=True) - clean.mean(1, keepdims=True)
                 cells = mean_text(trained), mean_text(clean), mean_text(change)
-                words = f"{', '.join(place)}, {int(updates):,} updates"
-                rows.append((words, f"`{names[0]}` minus `{names[1]}`", len(seeds), *cells))
+                rows.append((setting(place, updates), f"`{names[0]}` minus `{names[1]}`", len(seeds), *cells))
     return table_lines(("setting", "contrast", "n", "as trained", "clean", "as trained minus clean"), rows, (0, 1))
 
 
@@ -104,10 +117,12 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
         judged = {other["verdict"] for other in same_claim[place(row)]}
         judged = {verdict for verdict in judged if not verdict.startswith(UNJUDGED)}
         notes += ["depends on the budget"] * (len(judged) > 1)
-        setting = ", ".join(row[name] for name in ("task", "quality", "corruption"))
-        sides = f"`{row['left']}` minus `{row['right']}`"
+        updates = int(re.findall(BUDGET, row["left"])[0])
+        where = setting((row[name] for name in ("task", "quality", "corruption")), updates)
+        left, right = (re.sub(BUDGET, "", row[side]) for side in ("left", "right"))
+        sides = f"`{left}` minus `{right}`"
         seeds = f"{row['left_seeds']}, {row['right_seeds']}"
         tested = number(row["adjusted_p"], 3), number(row["smallest"], 0) + share, "; ".join([row["verdict"], *notes])
-        rows.append((setting, sides, seeds, shown, clean, *tested))
+        rows.append((where, sides, seeds, shown, clean, *tested))
     head = ("setting", "contrast", "n", "difference", "evaluated clean", "p (Holm)", "detectable", "verdict")
     return table_lines(head, rows, (0, 1, 7))

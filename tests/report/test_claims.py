@@ -166,9 +166,9 @@ def test_protocol_table_has_a_row_per_budget(tmp_path, monkeypatch):
             append_episodes(run / "episodes.csv", [row | clean for row in rows])
     monkeypatch.setattr("protocol_table.unranked", lambda rows: [])
     *_, one, two = lines(load_runs([tmp_path]))
-    assert "| `mik, updates 10` minus `acro, updates 10` | 4, 4 | 102 [" in one
+    assert "| walker_walk, expert, patch, 10 updates | `mik` minus `acro` | 4, 4 | 102 [" in one
     assert "| holds; opposite sign evaluated clean; depends on the budget |" in one
-    assert "| `mik, updates 20` minus `acro, updates 20` | 4, 4 | 2 [" in two
+    assert ", 20 updates | `mik` minus `acro` | 4, 4 | 2 [" in two
     assert "| undecided; opposite sign evaluated clean; depends on the budget |" in two
     assert re.search(r"\| \d+ \(\d+%\) \|", one)
     *_, one, two = importlib.import_module("protocol_table").paired_lines(load_runs([tmp_path]))
