@@ -161,6 +161,7 @@ def test_environment_without_seed_is_rejected():
         ({"metadata": {"render_fps": 20}}, 10),
         ({"metadata": {"render_fps": None}}, 15),
         ({"metadata": {"render_fps": "fast"}}, 15),
+        ({"metadata": {"render_fps": np.int64(20)}}, 10),
         ({"metadata": {}}, 15),
         ({"metadata": {"render_fps": 25}, "control_timestep": lambda self: 0.025}, 20),  # as shimmy's
     ],

@@ -13,7 +13,6 @@ import numpy as np
 from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError, in_one_line
-from vd4rl_pomdp.core.reading import fits
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, GymnasiumTask, Layout
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork, undisturbed
@@ -80,7 +79,8 @@ class GymnasiumEnv(PixelEnv):
         """Decisions per second: by dm_control's time step, the environment's `render_fps`, or 30."""
         step = getattr(self.env.unwrapped, "control_timestep", None)  # shimmy's render_fps is in milliseconds
         declared: Any = self.env.metadata.get("render_fps")
-        rate = 1 / step() if callable(step) else declared if fits(declared, float) and declared > 0 else 30
+        known = isinstance(declared, int | float | np.integer) and 0 < declared < math.inf
+        rate = 1 / step() if callable(step) else declared if known else 30
         return rate / self.task.action_repeat
 
     def close(self) -> None:
