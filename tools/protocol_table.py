@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from operator import itemgetter
 
@@ -20,12 +19,9 @@ from vd4rl_pomdp.report.gates import (
     opposite,
     unranked,
 )
-from vd4rl_pomdp.report.load import PROBES, Run
+from vd4rl_pomdp.report.load import PROBES, Run, label
 from vd4rl_pomdp.report.stats import number, with_interval
 from vd4rl_pomdp.runs.files import groups
-
-BUDGET = r", updates (\d+)"
-"""A budget in a label, which names it because runs of several are loaded; the tables tell it with the setting."""
 
 
 def place_of(run: Run) -> tuple[str, str, str, int]:
@@ -108,6 +104,7 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
             found.append(row | {"verdict": f"{UNJUDGED}missing seeds{other}" if few else verdict})
     place = itemgetter("claim", "task", "quality", "corruption")
     rows, same_claim = [], groups(found, place)
+    labelled = {(*place_of(run)[:3], label(run.named)): run for run in runs}
     for row in found:
         shown, clean = (
             with_interval(row[f"{kind}difference"], row[f"{kind}low"], row[f"{kind}high"], 0) for kind in ("", "clean_")
@@ -117,12 +114,11 @@ def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
         judged = {other["verdict"] for other in same_claim[place(row)]}
         judged = {verdict for verdict in judged if not verdict.startswith(UNJUDGED)}
         notes += ["depends on the budget"] * (len(judged) > 1)
-        updates = int(re.findall(BUDGET, row["left"])[0])
-        where = setting((row[name] for name in ("task", "quality", "corruption")), updates)
-        left, right = (re.sub(BUDGET, "", row[side]) for side in ("left", "right"))
-        sides = f"`{left}` minus `{right}`"
+        _, *where = place(row)
+        left, right = (labelled[*where, row[side]] for side in ("left", "right"))
+        sides = f"`{called(left)}` minus `{called(right)}`"
         seeds = f"{row['left_seeds']}, {row['right_seeds']}"
         tested = number(row["adjusted_p"], 3), number(row["smallest"], 0) + share, "; ".join([row["verdict"], *notes])
-        rows.append((where, sides, seeds, shown, clean, *tested))
+        rows.append((setting(where, place_of(left)[-1]), sides, seeds, shown, clean, *tested))
     head = ("setting", "contrast", "n", "difference", "evaluated clean", "p (Holm)", "detectable", "verdict")
     return table_lines(head, rows, (0, 1, 7))
